@@ -34,7 +34,7 @@ from asysplat.evaluation.post_optimization import (
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
-from asysplat.export.gaussians import read_background
+from asysplat.export.gaussians import read_notes
 from asysplat.export.scene_folder import check_visible, find_files, world_origin
 from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
@@ -164,8 +164,8 @@ def open_gaussians(
         gaussians = read(sample)[0]
         return lambda inputs: gaussians
 
-    colors = {name: read_background(file.path) for name, file in files.items()}
-    known = {name: color.to(device) for name, color in colors.items() if color is not None}
+    colors = {name: read_notes(file.path).background for name, file in files.items()}
+    known = {name: torch.tensor(color, device=device) for name, color in colors.items() if color}
     return predictor, described, known
 
 

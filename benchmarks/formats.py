@@ -13,8 +13,8 @@ from asysplat.errors import InputError
 from asysplat.export.gaussians import (
     READERS,
     WRITERS,
-    read_background,
     read_gaussians,
+    read_notes,
     write_gaussians,
 )
 from asysplat.export.likeness import COMPARED_VIEWS, picture_psnr
@@ -45,7 +45,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     if options.formats.scene is None:
         raise InputError("formats.scene is missing: give the scene.ply of a reconstruction.")
     file = Path(options.formats.scene)
-    gaussians, background = read_gaussians(file), read_background(file)
+    gaussians, notes = read_gaussians(file), read_notes(file)
     cameras = cameras_beside(file, gaussians)
     if cameras is None:
         raise InputError(
@@ -63,7 +63,7 @@ def measure(options: DictConfig, console: Console) -> Result:
             row = {"format": suffix, "megabytes": path.stat().st_size / 1e6} | common
             row |= {name: measurement.summary(name) for name in measurement.seconds}
             if path.suffix in READERS:
-                row["psnr"] = picture_psnr(gaussians, read_gaussians(path), cameras, background)
+                row["psnr"] = picture_psnr(gaussians, read_gaussians(path), cameras, notes)
             rows.append(row)
     return {"rows": rows}
 

@@ -490,12 +490,12 @@ def test_a_scene_is_kept_where_the_disk_is_full(make_scene, tmp_path, monkeypatc
     path = tmp_path / "run" / "scene.ply"
     lost = tmp_path / "lost" / "scene.ply"
     with pytest.raises(InputError, match=r"written to \S+home/lost-scene\.ply\."):
-        save_gaussians(lost, scene, (0.0, 0.0, 0.0))
+        save_gaussians(lost, scene)
     assert read_gaussians(tmp_path / "home" / "lost-scene.ply").num_gaussians == 40
     with largest_file(5000), pytest.raises(InputError, match=r"^(?!.*written to)"):
-        save_gaussians(path, scene, (0.0, 0.0, 0.0))
+        save_gaussians(path, scene)
     assert not list((tmp_path / "run").iterdir())
-    save_gaussians(path, scene, (0.0, 0.0, 0.0))
+    save_gaussians(path, scene)
     assert read_gaussians(path).num_gaussians == 40
 
 

@@ -3,8 +3,10 @@
 from asysplat.later import import_later
 
 LATER = {
+    "Notes": "asysplat.export.gaussians",
     "orbit": "asysplat.export.camera_paths",
     "read_gaussians": "asysplat.export.gaussians",
+    "read_notes": "asysplat.export.gaussians",
     "read_ply": "asysplat.export.formats.ply",
     "read_safetensors": "asysplat.export.formats.safetensors",
     "read_splat": "asysplat.export.formats.splat",

@@ -21,18 +21,16 @@ from pathlib import Path
 
 from asysplat.errors import InputError
 from asysplat.export.gaussians import (
-    BLACK,
     READERS,
     WRITERS,
-    read_background,
     read_gaussians,
-    read_offset,
+    read_notes,
     suffix_of,
     write_gaussians,
 )
 from asysplat.export.importance import most_important
 from asysplat.export.likeness import picture_psnr
-from asysplat.export.page import PAGE, write_page
+from asysplat.export.page import BLACK, PAGE, write_page
 from asysplat.export.scene_cameras import cameras_beside, names_beside
 from asysplat.interrupts import handle_signals
 
@@ -55,24 +53,23 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
         raise InputError(f"--keep is {keep:g}: give a fraction above 0, at most 1.")
     if output.exists():
         raise InputError(f"{output} exists: remove it, or name another file.")
-    gaussians = read_gaussians(scene)
-    offset, background = read_offset(scene), read_background(scene)
+    gaussians, notes = read_gaussians(scene), read_notes(scene)
     cameras = cameras_beside(scene, gaussians)
     written = gaussians
     if keep < 1:
         written = most_important(written, keep, cameras)
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
-    color = () if background is None else background.tolist()
     if cameras is not None and output.suffix.lower() == PAGE:
-        write_page(output, written, cameras, names_beside(scene), background=color or BLACK)
+        look = {"background": notes.background or BLACK, "antialiased": notes.antialiased}
+        write_page(output, written, cameras, names_beside(scene), **look)
     else:
-        write_gaussians(output, written, offset, color)
+        write_gaussians(output, written, notes)
     print(f"{output}: {written.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.2f} MB")
-    if any(offset) and read_offset(output) != offset:
-        print(f"{output.suffix} has no place for the offset {' '.join(map(repr, offset))}")
+    if any(notes.offset) and read_notes(output).offset != notes.offset:
+        print(f"{output.suffix} has no place for the offset {' '.join(map(repr, notes.offset))}")
     if cameras is not None and output.suffix.lower() in READERS:
-        likeness = picture_psnr(gaussians, read_gaussians(output), cameras, background)
+        likeness = picture_psnr(gaussians, read_gaussians(output), cameras, notes)
         print(f"{likeness:.1f} dB against the pictures of {scene}")
 
 

@@ -4,25 +4,42 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.export.formats.compressed_ply import SUFFIX, write_compressed_ply
 from asysplat.export.formats.glb import read_glb, write_glb
 from asysplat.export.formats.ply import read_comment, read_ply, write_ply
 from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
+from asysplat.export.formats.sog import is_antialiased as is_antialiased_sog
 from asysplat.export.formats.sog import read_sog, write_sog
 from asysplat.export.formats.splat import read_splat, write_splat
+from asysplat.export.formats.spz import is_antialiased as is_antialiased_spz
 from asysplat.export.formats.spz import read_spz, write_spz
-from asysplat.export.page import PAGE, write_page
+from asysplat.export.page import BLACK, PAGE, write_page
 from asysplat.export.scene_cameras import camera_before
 from asysplat.scene import Gaussians
 
-BLACK = (0.0, 0.0, 0.0)
 MAX_TEXT = 80  # characters of a file in a message
+
+
+class Notes(NamedTuple):
+    """What a file says besides its Gaussians.
+
+    Args:
+        offset: to be added to the means, for the coordinates of the photographs.
+        background: RGB in [0, 1] behind the Gaussians; empty: unknown.
+        antialiased: whether they are to be rendered so, see `render`.
+    """
+
+    offset: Sequence[float] = (0.0, 0.0, 0.0)
+    background: Sequence[float] = ()
+    antialiased: bool = False
+
+
+NO_NOTES = Notes()
 READERS = {
     ".ply": lambda path, dtype: read_ply(path).to(dtype),
     ".spz": lambda path, dtype: read_spz(path).to(dtype),
@@ -31,19 +48,21 @@ READERS = {
     ".splat": lambda path, dtype: read_splat(path).to(dtype),
     ".safetensors": lambda path, dtype: read_safetensors(path, dtype)[0],
 }
-# The other formats have no place for an offset and a background.
+# Of the notes, a file has what its format has a place for.
 WRITERS = {
-    SUFFIX: lambda path, gaussians, *_: write_compressed_ply(path, gaussians),
-    ".ply": write_ply,
-    ".spz": lambda path, gaussians, *_: write_spz(path, gaussians),
-    ".sog": lambda path, gaussians, *_: write_sog(path, gaussians),
-    ".glb": lambda path, gaussians, *_: write_glb(path, gaussians),
-    ".splat": lambda path, gaussians, *_: write_splat(path, gaussians),
-    ".safetensors": lambda path, gaussians, *numbers: write_safetensors(
-        path, gaussians, _metadata(*numbers)
-    ),
-    PAGE: lambda path, gaussians, _, background: write_page(
-        path, gaussians, camera_before(gaussians), background=background or BLACK
+    SUFFIX: lambda path, scene, notes: write_compressed_ply(path, scene, notes.antialiased),
+    ".ply": lambda path, scene, notes: write_ply(path, scene, *notes),
+    ".spz": lambda path, scene, notes: write_spz(path, scene, antialiased=notes.antialiased),
+    ".sog": lambda path, scene, notes: write_sog(path, scene, notes.antialiased),
+    ".glb": lambda path, scene, _: write_glb(path, scene),
+    ".splat": lambda path, scene, _: write_splat(path, scene),
+    ".safetensors": lambda path, scene, notes: write_safetensors(path, scene, _metadata(notes)),
+    PAGE: lambda path, scene, notes: write_page(
+        path,
+        scene,
+        camera_before(scene),
+        background=notes.background or BLACK,
+        antialiased=notes.antialiased,
     ),
 }
 
@@ -73,55 +92,50 @@ def read_gaussians(
     gaussians = READERS[suffix_of(path, READERS, "read")](path, dtype)
     if origin is None:
         return gaussians
-    offset = torch.tensor(read_offset(Path(path)), dtype=torch.float64)
+    offset = torch.tensor(read_notes(Path(path)).offset, dtype=torch.float64)
     shift = offset - torch.tensor(origin, dtype=torch.float64)
     return replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
 
 
-def read_offset(path: Path) -> list[float]:
-    """Read what is to be added to the means of a file for the coordinates of its photographs.
+def read_notes(path: Path) -> Notes:
+    """Read what a file says besides its Gaussians.
 
     Raises:
-        InputError: numbers that are not finite.
+        InputError: numbers that are not finite, or see the format's reader.
     """
-    return _numbers(path, "offset") or [0.0, 0.0, 0.0]
+    texts, antialiased = {}, False
+    match path.suffix.lower():
+        case ".ply":
+            texts = {name: read_comment(path, name) for name in Notes._fields}
+        case ".safetensors":
+            texts = read_safetensors(path)[1]
+        case ".spz":
+            antialiased = is_antialiased_spz(path)
+        case ".sog":
+            antialiased = is_antialiased_sog(path)
+    numbers = {name: _numbers(path, name, texts.get(name, "")) for name in ("offset", "background")}
+    return Notes(
+        offset=numbers["offset"] or NO_NOTES.offset,
+        background=numbers["background"],
+        antialiased=antialiased or texts.get("antialiased", "").strip() == "1",
+    )
 
 
-def read_background(path: Path) -> Float[Tensor, "3"] | None:
-    """Read the RGB that was behind a file's Gaussians when they were made; None if unknown.
-
-    Raises:
-        InputError: numbers that are not finite.
-    """
-    color = _numbers(path, "background")
-    return None if color is None else torch.tensor(color)
-
-
-def _numbers(path: Path, name: str) -> list[float] | None:
-    """Read three numbers from a file's comments or metadata; None where it has none."""
-    text = ""
-    if path.suffix.lower() == ".ply":
-        text = read_comment(path, name)
-    elif path.suffix.lower() == ".safetensors":
-        text = read_safetensors(path)[1].get(name, "")
+def _numbers(path: Path, name: str, text: str) -> tuple[float, ...]:
+    """Read three numbers; none where a text has no three numbers."""
     try:
         x, y, z = map(float, text.split())
     except ValueError:
-        return None
+        return ()
     if not all(map(math.isfinite, (x, y, z))):
         raise InputError(
             f"{path} has the {name} {text.strip()[:MAX_TEXT]}: give three finite numbers, or "
             "remove it."
         )
-    return [x, y, z]
+    return x, y, z
 
 
-def write_gaussians(
-    path: str | Path,
-    gaussians: Gaussians,
-    offset: Sequence[float] = (0.0, 0.0, 0.0),
-    background: Sequence[float] = (),
-) -> None:
+def write_gaussians(path: str | Path, gaussians: Gaussians, notes: Notes = NO_NOTES) -> None:
     """Write one scene, without batch dimension, in the format of the file's suffix.
 
     An existing file is replaced once the new one is complete.
@@ -130,8 +144,7 @@ def write_gaussians(
         path: a .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors or .html file; see
             `write_page` for a page with cameras.
         gaussians: [N].
-        offset: to be added to the means; kept by .ply and .safetensors.
-        background: RGB in [0, 1] behind the Gaussians, if known; kept likewise.
+        notes: what else the file says, as far as its format has a place for it.
 
     Raises:
         InputError: another suffix, or see the format's writer.
@@ -140,12 +153,13 @@ def write_gaussians(
         >>> from asysplat import read_gaussians, write_gaussians
         >>> write_gaussians("scene.spz", read_gaussians("scene.ply"))
     """
-    WRITERS[suffix_of(path, WRITERS, "written")](path, gaussians, offset, background)
+    WRITERS[suffix_of(path, WRITERS, "written")](path, gaussians, notes)
 
 
-def _metadata(offset: Sequence[float], background: Sequence[float]) -> dict[str, str]:
-    """Write an offset that is not 0, and a background that is known, as metadata."""
-    numbers = {"offset": offset if any(offset) else (), "background": background}
+def _metadata(notes: Notes) -> dict[str, str]:
+    """Write an offset that is not 0, a background that is known, and antialiasing."""
+    numbers = {"offset": notes.offset if any(notes.offset) else (), "background": notes.background}
+    numbers["antialiased"] = (1,) if notes.antialiased else ()
     return {name: " ".join(map(repr, values)) for name, values in numbers.items() if values}
 
 

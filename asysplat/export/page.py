@@ -20,6 +20,7 @@ from asysplat.rendering.interface import INRIA
 from asysplat.scene import Cameras, Gaussians
 
 PAGE = ".html"
+BLACK = (0.0, 0.0, 0.0)
 FILES = Path(__file__).parent / "page_files"
 SCRIPTS = ("scene.js", "camera.js", "renderer.js", "viewer.js")  # one module, in this order
 SH_FACTORS = ("SH_C0", "Y1", "Y2", "Y2_0", "Y3_3", "Y3_2", "Y3_1", "Y3_0")
@@ -35,7 +36,7 @@ def write_page(
     cameras: Cameras,
     names: Sequence[str] = (),
     title: str = "",
-    background: Sequence[int | float] = (0, 0, 0),
+    background: Sequence[int | float] = BLACK,
     antialiased: bool = False,
 ) -> None:
     """Write one scene and its viewer as one HTML file, which needs no server and no network.

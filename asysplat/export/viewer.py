@@ -35,7 +35,7 @@ from asysplat.data.photographs import open_photographs
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import viewer_cameras
-from asysplat.export.gaussians import read_gaussians
+from asysplat.export.gaussians import read_gaussians, read_notes
 from asysplat.export.scene_cameras import camera_before, cameras_beside
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
@@ -76,12 +76,19 @@ class Viewer:
         views: input views, [V]; of images of one pixel, frames alone are drawn.
         gaussians: [N]; None to `show` them later.
         port: port of this machine; the next free one is used if it is taken; 0: any free one.
+        antialiased: see `render`; the panel changes it.
 
     Raises:
         InputError: viser is not installed; views or Gaussians with batch dimensions.
     """
 
-    def __init__(self, views: Views, gaussians: Gaussians | None = None, port: int = 8080):
+    def __init__(
+        self,
+        views: Views,
+        gaussians: Gaussians | None = None,
+        port: int = 8080,
+        antialiased: bool = False,
+    ):
         try:
             import viser
         except ImportError as error:
@@ -99,7 +106,7 @@ class Viewer:
         self._closed = Event()
         with _own_pages_only():
             self._server = viser.ViserServer("127.0.0.1", port, label="asysplat", verbose=False)
-        self._add_panel()
+        self._add_panel(antialiased)
         self._add_cameras(views.images)
         if gaussians is not None:
             self.show(gaussians)
@@ -154,7 +161,7 @@ class Viewer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _add_panel(self) -> None:
+    def _add_panel(self, antialiased: bool) -> None:
         gui = self._server.gui
         # The share button would open the viewer to anyone, through a server of viser's.
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -162,7 +169,9 @@ class Viewer:
         self._sh_degree = gui.add_slider("SH degree", 0, 3, 1, 3)
         self._min_opacity = gui.add_slider("Minimum opacity", 0.0, 1.0, 0.01, 0.0)
         self._size = gui.add_slider("Size", 0.05, 1.0, 0.05, 1.0)
+        self._antialiased = gui.add_checkbox("Antialiased", antialiased)
         self._settings = (self._layer, self._sh_degree, self._min_opacity, self._size)
+        self._settings += (self._antialiased,)
         for handle in self._settings:
             handle.on_update(lambda _: self._change())
         self._show_cameras = gui.add_checkbox("Cameras", True)
@@ -284,6 +293,7 @@ def draw_layer(
     sh_degree: int = 3,
     min_opacity: float = 0.0,
     size: float = 1.0,
+    antialiased: bool = False,
 ) -> UInt8[ndarray, "H W 3"]:
     """Render one layer of a scene, as colors.
 
@@ -293,11 +303,13 @@ def draw_layer(
         layer: "color", "alpha", or "depth": disparities, the nearest bright.
         sh_degree: maximum degree of SH.
         size: factor of the scales, > 0.
+        antialiased: see `render`.
     """
     opacities = gaussians.opacities
     opacities = opacities.where(opacities >= min_opacity, 0)
     gaussians = replace(gaussians, scales=size * gaussians.scales, opacities=opacities)
-    rendering = render(gaussians, camera, depth=layer == "depth", sh_degree=sh_degree)
+    options = {"sh_degree": sh_degree, "antialiased": antialiased}
+    rendering = render(gaussians, camera, depth=layer == "depth", **options)
     if layer == "depth":
         values = disparity(rendering.depth[0])
         sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]
@@ -330,7 +342,7 @@ def main(scene: str, folder: str | None) -> None:
             gaussians = read_gaussians(scene)
             cameras = cameras_beside(Path(scene), gaussians) or camera_before(gaussians)
             views = Views(cameras.resized(1, 1), torch.zeros(cameras.num_views, 3, 1, 1))
-        with Viewer(views, gaussians) as viewer:
+        with Viewer(views, gaussians, antialiased=read_notes(Path(scene)).antialiased) as viewer:
             print(f"viewer: {viewer.url}, until Ctrl-C")
             viewer.wait()
     except InputError as error:

@@ -24,7 +24,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import write_gaussians, write_page, write_video
-from asysplat.export.gaussians import WRITERS
+from asysplat.export.gaussians import NO_NOTES, WRITERS, Notes
 from asysplat.export.page import PAGE
 from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
@@ -94,11 +94,12 @@ class Results:
             InputError: a file cannot be written; the scene is elsewhere then, see `save_gaussians`.
         """
         photographs, background = self._photographs, self._background.tolist()
+        notes = Notes(photographs.origin, background)
         world = photographs.normalization.to_world(gaussians)
         for suffix in self._suffixes:
             path = self.folder / f"scene{suffix}"
             if suffix != PAGE:
-                save_gaussians(path, world, photographs.origin, background)
+                save_gaussians(path, world, notes)
                 continue
             cameras = photographs.normalization.cameras_to_world(photographs.inputs.cameras)
             names = [Path(file).name for file in photographs.input_files]
@@ -212,9 +213,7 @@ def read_outputs(output: str | Sequence[str]) -> list[str]:
     return [f".{name}" for name in names if f".{name}" != Path(SCENE).suffix]
 
 
-def save_gaussians(
-    path: Path, gaussians: Gaussians, offset: Sequence[float], background: Sequence[float] = ()
-) -> None:
+def save_gaussians(path: Path, gaussians: Gaussians, notes: Notes = NO_NOTES) -> None:
     """Write a scene; where that fails, write it elsewhere, as the refinement took long.
 
     Raises:
@@ -222,12 +221,12 @@ def save_gaussians(
             for temporary files, or else the user's.
     """
     try:
-        write_gaussians(path, gaussians, offset, background)
+        write_gaussians(path, gaussians, notes)
     except InputError as failure:
         for folder in (Path(tempfile.gettempdir()), Path.home()):
             rescued = folder / f"{path.parent.name}-{path.name}"
             try:
-                write_gaussians(rescued, gaussians, offset, background)
+                write_gaussians(rescued, gaussians, notes)
             except InputError:
                 continue
             raise InputError(f"{failure} The scene was written to {rescued}.") from None

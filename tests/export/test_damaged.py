@@ -11,6 +11,7 @@ from plyfile import PlyData
 from asysplat import read_gaussians, write_gaussians
 from asysplat.errors import InputError
 from asysplat.export.formats.spz import write_spz
+from asysplat.export.gaussians import Notes
 
 NAMES = ("a.ply", "text.ply", "a.compressed.ply", "2.spz", "3.spz", "4.spz", "a.sog", "a.glb")
 NAMES += ("a.splat", "a.safetensors")
@@ -20,7 +21,7 @@ NAMES += ("a.splat", "a.safetensors")
 def files(make_scene, tmp_path_factory):
     folder, scene = tmp_path_factory.mktemp("files"), make_scene(count=300, degree=2)[0]
     for name in NAMES:
-        write_gaussians(folder / name, scene, (1e6, 2.0, 3.0), (0.25, 0.5, 0.75))
+        write_gaussians(folder / name, scene, Notes((1e6, 2.0, 3.0), (0.25, 0.5, 0.75)))
     for version in (2, 3, 4):
         write_spz(folder / f"{version}.spz", scene, version)
     ply = PlyData.read(folder / "a.ply")

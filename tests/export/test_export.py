@@ -10,6 +10,7 @@ from asysplat import read_gaussians, render, write_gaussians
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.export.__main__ import export
+from asysplat.export.gaussians import Notes
 from asysplat.export.importance import blending_weights, most_important
 from asysplat.export.scene_cameras import CAMERAS
 from asysplat.geometry.spherical_harmonics import SH_C0
@@ -24,7 +25,7 @@ def scene(make_scene):
 def file(scene, tmp_path):
     """A scene with its cameras beside it, an offset and a background."""
     gaussians, cameras = scene
-    write_gaussians(tmp_path / "scene.ply", gaussians, (1e6, 0.0, 0.0), (0.5, 0.25, 1.0))
+    write_gaussians(tmp_path / "scene.ply", gaussians, Notes((1e6, 0.0, 0.0), (0.5, 0.25, 1.0)))
     content = describe_cameras(cameras, [f"{view}.png" for view in range(3)])
     (tmp_path / CAMERAS).write_text(json.dumps(content))
     return tmp_path / "scene.ply"

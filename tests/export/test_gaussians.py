@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from asysplat import read_gaussians, write_gaussians
 from asysplat.errors import InputError
 from asysplat.export import read_safetensors, write_ply, write_safetensors
-from asysplat.export.gaussians import WRITERS, read_background, read_offset
+from asysplat.export.gaussians import WRITERS, Notes, read_notes
 from asysplat.export.page import PAGE
 from asysplat.scene import Gaussians
 
@@ -46,16 +46,16 @@ def test_every_format_that_is_written_is_read(scene, tmp_path, suffix):
     assert read_gaussians(tmp_path / f"a scene{suffix}").num_gaussians == scene.num_gaussians
 
 
-def test_offset_and_background_are_kept_where_there_is_a_place(scene, tmp_path):
-    offset, background = (1e7, -2.5, 0.1), (0.25, 0.5, 1.0)
-    for suffix in READABLE:
-        file = tmp_path / f"scene{suffix}"
-        write_gaussians(file, scene, offset, background)
-        if suffix in (".ply", ".safetensors"):
-            assert read_offset(file) == list(offset)
-            assert read_background(file).tolist() == list(background)
-        else:
-            assert read_offset(file) == [0, 0, 0] and read_background(file) is None
+@pytest.mark.parametrize("suffix", READABLE)
+def test_notes_are_kept_where_there_is_a_place(scene, tmp_path, suffix):
+    notes = Notes((1e7, -2.5, 0.1), (0.25, 0.5, 1.0), antialiased=True)
+    file = tmp_path / f"scene{suffix}"
+    write_gaussians(file, scene, notes)
+    numbers, flag = suffix in (".ply", ".safetensors"), suffix not in (".glb", ".splat")
+    kept = (notes if numbers else Notes())._replace(antialiased=flag)
+    assert read_notes(file) == kept
+    write_gaussians(file, scene)
+    assert read_notes(file) == Notes()
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.safetensors"])
@@ -167,7 +167,7 @@ def test_a_background_comes_back_as_it_was(scene, tmp_path):
     write_ply(tmp_path / "scene.ply", scene, background=black)
     text = " ".join(map(repr, blue))
     write_safetensors(tmp_path / "scene.safetensors", scene, {"background": text})
-    assert read_background(tmp_path / "scene.ply").tolist() == list(black)
-    assert read_background(tmp_path / "scene.safetensors").tolist() == blue
+    assert read_notes(tmp_path / "scene.ply").background == black
+    assert list(read_notes(tmp_path / "scene.safetensors").background) == blue
     write_ply(tmp_path / "scene.ply", scene)
-    assert read_background(tmp_path / "scene.ply") is None
+    assert read_notes(tmp_path / "scene.ply").background == ()

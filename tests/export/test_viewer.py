@@ -130,7 +130,8 @@ def test_pictures_do_not_pile_up_for_a_page_that_does_not_read(viewer):
 def test_the_panel_changes_the_rendering(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     camera = cameras.select([1])
-    settings = [(layer, 1, 0.0, 1.0) for layer in LAYERS] + [("color", 0, 0.5, 0.5)]
+    settings = [(layer, 1, 0.0, 1.0, False) for layer in LAYERS]
+    settings += [("color", 0, 0.5, 0.5, True)]
     expected = [draw_layer(gaussians, camera, *values) for values in settings]
     for one, other in combinations(expected, 2):
         assert np.abs(one.astype(int) - other).mean() > 2 * TOLERANCE

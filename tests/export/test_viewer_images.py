@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from types import SimpleNamespace
 
@@ -146,3 +147,5 @@ def test_settings_of_the_panel_change_what_is_drawn(scene):
         assert (drawn != draw_layer(gaussians, camera)).any()
     alphas = [draw_layer(gaussians, camera, layer="alpha", size=size).mean() for size in (0.5, 1.0)]
     assert alphas[0] < 0.8 * alphas[1]
+    small = partial(draw_layer, gaussians, camera, layer="alpha", size=0.05)
+    assert small(antialiased=True).mean() < 0.8 * small().mean()

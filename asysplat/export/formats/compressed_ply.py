@@ -38,10 +38,15 @@ REST_COUNTS = (9, 24, 45)  # numbers of SH above degree 0, for degrees 1 to 3
 ELEMENTS = ("chunk", "vertex", "sh")
 
 
-def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> None:
     """Write one scene, without batch dimension, as compressed PLY.
 
     Gaussians are ordered along a Z-order curve, so that those of a range are near each other.
+
+    Args:
+        path: the file.
+        gaussians: [N].
+        antialiased: as for `render`: a comment tells it.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -77,7 +82,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     ]
     sh = scene.sh[:, 1:].mT.flatten(1).numpy()
     steps = np.floor((sh / SH_RANGE + 0.5) * 256).clip(0, 255).astype(np.uint8)
-    header = ["ply", "format binary_little_endian 1.0"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment antialiased {int(antialiased)}"]
     header += [f"element chunk {chunks}", *(f"property float {name}" for name in RANGES)]
     header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     if steps.size:

@@ -31,11 +31,12 @@ def write_ply(
     gaussians: Gaussians,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
     background: Sequence[float] = (),
+    antialiased: bool = False,
 ) -> None:
     """Write one scene, without batch dimension, as binary little-endian PLY.
 
     Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7. Comments say what a
-    renderer needs to know: `antialiased 0`, as `render` draws by default, and `sh_degree`.
+    renderer needs to know: `antialiased 0` or `1`, and `sh_degree`.
 
     Args:
         path: the file.
@@ -43,6 +44,8 @@ def write_ply(
         offset: to be added to the means, which float32 may not resolve: written as a comment,
             `comment offset X Y Z`, if it is not 0.
         background: RGB in [0, 1] behind the Gaussians, if known: written as a comment likewise.
+
+        antialiased: as for `render`.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -63,7 +66,11 @@ def write_ply(
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
     header = ["ply", "format binary_little_endian 1.0"]
     degree = math.isqrt(gaussians.sh.shape[1]) - 1
-    comments = {"antialiased": (0,), "sh_degree": (degree,), "background": background}
+    comments = {
+        "antialiased": (int(antialiased),),
+        "sh_degree": (degree,),
+        "background": background,
+    }
     comments |= {"offset": offset} if any(offset) else {}
     header += [f"comment {k} {' '.join(map(repr, v))}" for k, v in comments.items() if v]
     header += [f"element vertex {len(table)}"]

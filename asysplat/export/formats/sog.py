@@ -47,7 +47,7 @@ IMAGE_ERRORS = (OSError, ValueError, EOFError, SyntaxError, RuntimeError, Memory
 IMAGE_ERRORS += (Image.DecompressionBombWarning, Image.DecompressionBombError)
 
 
-def write_sog(path: str | Path, gaussians: Gaussians) -> None:
+def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> None:
     """Write one scene, without batch dimension, as a SOG bundle.
 
     Means keep 16 bits of sign(x) log(1 + |x|) between the scene's bounds, opacities and three
@@ -58,16 +58,17 @@ def write_sog(path: str | Path, gaussians: Gaussians) -> None:
     Args:
         path: the file.
         gaussians: [N].
+        antialiased: as for `render`: meta.json tells it.
 
     Raises:
         InputError: invalid Gaussians, too many, or a file that cannot be written.
     """
-    content = encode_sog(gaussians)
+    content = encode_sog(gaussians, antialiased)
     with atomic_write(path) as partial:
         partial.write_bytes(content)
 
 
-def encode_sog(gaussians: Gaussians) -> bytes:
+def encode_sog(gaussians: Gaussians, antialiased: bool = False) -> bytes:
     """Return the content of a SOG bundle, or raise InputError; see `write_sog`."""
     scene = in_morton_order(prepare_for_export(gaussians))
     count = len(scene.opacities)
@@ -86,7 +87,7 @@ def encode_sog(gaussians: Gaussians) -> bytes:
             "shN_centroids.webp": _webp(centroids, row),
             "shN_labels.webp": _webp(labels, width),
         }
-    meta = {"version": VERSION, "count": count, "antialias": False, **records}
+    meta = {"version": VERSION, "count": count, "antialias": antialiased, **records}
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
     bundle = BytesIO()
     with zipfile.ZipFile(bundle, "w") as archive:
@@ -229,16 +230,8 @@ def read_sog(path: str | Path) -> Gaussians:
         InputError: not a SOG bundle, a damaged one, another version, or invalid Gaussians.
     """
     path = require_file(path)
-    try:
-        archive = zipfile.ZipFile(path)
-    except ZIP_ERRORS as error:
-        raise InputError(
-            f"{path} cannot be read as a zip file ({error}): it is damaged or no SOG bundle; copy "
-            "it again."
-        ) from error
-    with archive:
-        meta = parse_record(path, "meta.json", _content(archive, path, "meta.json"))
-        meta.integer("version", VERSION, VERSION)
+    with _open(path) as archive:
+        meta = _read_meta(archive, path)
         count = meta.integer("count", 1, MAX_SIDE**2)
         means, scales, quats, colors = map(meta.record, ("means", "scales", "quats", "sh0"))
         low, high = (torch.tensor(means.numbers(key, 3)).double() for key in ("mins", "maxs"))
@@ -262,6 +255,32 @@ def read_sog(path: str | Path) -> Gaussians:
         sh=torch.cat(sh, 1),
     )
     return gaussians.validate(f"{path}: Gaussians")
+
+
+def is_antialiased(path: Path) -> bool:
+    """Read whether a file is to be rendered with `antialiased`.
+
+    Raises:
+        InputError: see `read_sog`.
+    """
+    with _open(path) as archive:
+        return _read_meta(archive, path).values.get("antialias") is True
+
+
+def _open(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except ZIP_ERRORS as error:
+        raise InputError(
+            f"{path} cannot be read as a zip file ({error}): it is damaged or no SOG bundle; copy "
+            "it again."
+        ) from error
+
+
+def _read_meta(archive: zipfile.ZipFile, path: Path) -> JsonRecord:
+    meta = parse_record(path, "meta.json", _content(archive, path, "meta.json"))
+    meta.integer("version", VERSION, VERSION)
+    return meta
 
 
 def _decode(record: JsonRecord, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:

@@ -31,6 +31,7 @@ HEADER = struct.Struct(
 )  # magic, version, count, SH degree, fraction bits, flags, streams
 TABLE = struct.Struct("<QQ")  # of a stream in version 4: compressed and full size
 HEADER_4 = 32  # bytes of the header in version 4
+ANTIALIASED = 1  # a flag
 SH_SIZES = (0, 9, 24, 45, 72)  # numbers per Gaussian, by degree; of degree 4, 45 are read
 MAX_FRACTION_BITS = 23  # of a position's 24, one of which is the sign
 SMALL_QUANTILE, STEPS_PER_SIZE = 0.01, 16  # Gaussians' size that sets the precision of positions
@@ -48,6 +49,7 @@ class Header(NamedTuple):
     count: int
     degree: int
     fraction_bits: int
+    antialiased: bool
 
     def sizes(self) -> list[int]:
         """Return the bytes of positions, alphas, colors, scales, rotations and SH."""
@@ -55,7 +57,9 @@ class Header(NamedTuple):
         return [self.count * size for size in (9, 1, 3, 3, rotation, SH_SIZES[self.degree])]
 
 
-def write_spz(path: str | Path, gaussians: Gaussians, version: int = 3) -> None:
+def write_spz(
+    path: str | Path, gaussians: Gaussians, version: int = 3, antialiased: bool = False
+) -> None:
     """Write one scene, without batch dimension, as SPZ.
 
     Positions are rounded to a 16th of the small Gaussians' size if 24 bits allow, scales to 3 %,
@@ -66,17 +70,18 @@ def write_spz(path: str | Path, gaussians: Gaussians, version: int = 3) -> None:
         path: the file.
         gaussians: [N].
         version: 2 or 3, gzip, which most programs read; 4, Zstandard, needs the package zstandard.
+        antialiased: as for `render`: a flag tells it.
 
     Raises:
         InputError: invalid Gaussians, another version, a file that cannot be written, or
             zstandard is missing.
     """
-    content = encode_spz(gaussians, version)
+    content = encode_spz(gaussians, version, antialiased)
     with atomic_write(path) as partial:
         partial.write_bytes(content)
 
 
-def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
+def encode_spz(gaussians: Gaussians, version: int = 3, antialiased: bool = False) -> bytes:
     """Return the content of an SPZ file; see `write_spz`.
 
     Raises:
@@ -86,9 +91,16 @@ def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
     scene = in_morton_order(half_turn(prepare_for_export(gaussians), 0))
     fraction_bits = _fraction_bits(scene)
-    degree = int(scene.sh.shape[1] ** 0.5) - 1
+    degree = math.isqrt(scene.sh.shape[1]) - 1
     streams = [stream.tobytes() for stream in _streams(scene, fraction_bits, version)]
-    header = [MAGIC, version, len(scene.opacities), degree, fraction_bits, 0]
+    header = [
+        MAGIC,
+        version,
+        len(scene.opacities),
+        degree,
+        fraction_bits,
+        ANTIALIASED * antialiased,
+    ]
     if version < 4:
         return gzip.compress(b"".join([HEADER.pack(*header, 0), *streams]), GZIP_LEVEL, mtime=0)
     streams = [stream for stream in streams if stream]
@@ -176,6 +188,19 @@ def read_spz(path: str | Path) -> Gaussians:
     return half_turn(gaussians, 0).validate(f"{path}: Gaussians")
 
 
+def is_antialiased(path: Path) -> bool:
+    """Read whether a file is to be rendered with `antialiased`.
+
+    Raises:
+        InputError: see `read_spz`.
+    """
+    with open(path, "rb") as file:
+        version_4 = file.read(4) == MAGIC
+        file.seek(0)
+        stream = file if version_4 else gzip.GzipFile(fileobj=file)
+        return _header(path, _take(path, stream.read, HEADER.size))[0].antialiased
+
+
 def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
     """Unpack rotations of 3 or 4 bytes to quaternions, xyzw."""
     if rotations.shape[1] == 3:
@@ -242,7 +267,7 @@ def _take(
 
 def _header(path: Path, content: bytearray) -> tuple[Header, int]:
     """Read a header, and the number of streams, which versions 2 and 3 do not use."""
-    magic, version, count, degree, fraction_bits, _, streams = HEADER.unpack(content)
+    magic, version, count, degree, fraction_bits, flags, streams = HEADER.unpack(content)
     if magic != MAGIC:
         raise InputError(f"{path} is not an SPZ file: expected {MAGIC.decode()} at its beginning.")
     for name, value, low, high in (
@@ -254,7 +279,7 @@ def _header(path: Path, content: bytearray) -> tuple[Header, int]:
             raise InputError(f"{path} has the {name} {value}: expected {low} to {high}.")
     if count == 0:
         raise InputError(f"{path} has no Gaussians: expected one or more.")
-    return Header(version, count, degree, fraction_bits), streams
+    return Header(version, count, degree, fraction_bits, bool(flags & ANTIALIASED)), streams
 
 
 def _zstandard() -> ModuleType:
