@@ -138,7 +138,7 @@ def test_parts_of_a_killed_write_are_removed(tmp_path):
 
 
 def test_a_reconstruction_is_no_run(tmp_path):
-    (tmp_path / "scene.ply").touch()
+    (tmp_path / "scene.safetensors").touch()
     (tmp_path / "metrics.json").write_text("{}")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
