@@ -123,7 +123,8 @@ def check_reader(
             message = str(error)
             assert message.startswith(str(path)), (index, message)
             assert re.fullmatch(r"[^\n]{20,600}\.", message), (index, message)
-            assert not re.search(r"\. [A-Z]", message), (index, message)
+            own_words = re.sub(r"'.*'", "", message)  # without what it quotes of the file
+            assert not re.search(r"\. [A-Z]", own_words), (index, message)
             counts[1] += 1
         except BaseException as error:
             error.add_note(f"of damaged file {index}")

@@ -109,6 +109,9 @@ def unpack(path: Path, elements: dict[str, ndarray]) -> Gaussians:
         )
     names = RANGES if "min_r" in chunks.dtype.names else RANGES[:12]
     ranges = _columns(path, "chunk", chunks, names, np.float32).reshape(len(chunks), -1, 2, 3)
+    if not np.isfinite(ranges).all():
+        index = np.argwhere(~np.isfinite(ranges))[0][0]
+        raise InputError(f"{path} has a range {index} that is not finite: repair or remove it.")
     ranges = ranges[np.arange(len(vertices)) // CHUNK]
     packed = _columns(path, "vertex", vertices, PACKED, np.uint32).T
     (position, rotation, scale, color) = (
