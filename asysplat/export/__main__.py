@@ -8,7 +8,10 @@ from argparse import ArgumentParser
 if __name__ == "__main__":  # now, since torch takes seconds
     parser = ArgumentParser("asysplat export", description=__doc__.split("\n")[0])
     parser.add_argument("scene", help="a file of Gaussians")
-    parser.add_argument("output", help="the new file; its suffix names the format")
+    parser.add_argument(
+        "output",
+        help="the new file: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors or .html",
+    )
     parser.add_argument(
         "--keep", type=float, default=1.0, metavar="F", help="keep this fraction, by importance"
     )
@@ -57,6 +60,8 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     cameras = cameras_beside(scene, gaussians)
     written = gaussians
     if keep < 1:
+        pictures = 0 if cameras is None else cameras.num_views
+        print(f"weighing {written.num_gaussians:,} Gaussians in {pictures} pictures")
         written = most_important(written, keep, cameras)
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
