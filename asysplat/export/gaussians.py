@@ -9,14 +9,13 @@ from typing import NamedTuple
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.formats.compressed_ply import SUFFIX, write_compressed_ply
+from asysplat.export.formats import sog, spz
+from asysplat.export.formats.compressed_ply import write_compressed_ply
 from asysplat.export.formats.glb import read_glb, write_glb
 from asysplat.export.formats.ply import read_comment, read_ply, write_ply
-from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
-from asysplat.export.formats.sog import is_antialiased as is_antialiased_sog
+from asysplat.export.formats.safetensors import read_metadata, read_safetensors, write_safetensors
 from asysplat.export.formats.sog import read_sog, write_sog
 from asysplat.export.formats.splat import read_splat, write_splat
-from asysplat.export.formats.spz import is_antialiased as is_antialiased_spz
 from asysplat.export.formats.spz import read_spz, write_spz
 from asysplat.export.page import BLACK, PAGE, write_page
 from asysplat.export.scene_cameras import camera_before
@@ -50,7 +49,9 @@ READERS = {
 }
 # Of the notes, a file has what its format has a place for.
 WRITERS = {
-    SUFFIX: lambda path, scene, notes: write_compressed_ply(path, scene, notes.antialiased),
+    ".compressed.ply": lambda path, scene, notes: write_compressed_ply(
+        path, scene, notes.antialiased
+    ),
     ".ply": lambda path, scene, notes: write_ply(path, scene, *notes),
     ".spz": lambda path, scene, notes: write_spz(path, scene, antialiased=notes.antialiased),
     ".sog": lambda path, scene, notes: write_sog(path, scene, notes.antialiased),
@@ -108,11 +109,11 @@ def read_notes(path: Path) -> Notes:
         case ".ply":
             texts = {name: read_comment(path, name) for name in Notes._fields}
         case ".safetensors":
-            texts = read_safetensors(path)[1]
+            texts = read_metadata(path)
         case ".spz":
-            antialiased = is_antialiased_spz(path)
+            antialiased = spz.is_antialiased(path)
         case ".sog":
-            antialiased = is_antialiased_sog(path)
+            antialiased = sog.is_antialiased(path)
     numbers = {name: _numbers(path, name, texts.get(name, "")) for name in ("offset", "background")}
     return Notes(
         offset=numbers["offset"] or NO_NOTES.offset,

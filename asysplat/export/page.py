@@ -47,8 +47,8 @@ def write_page(
         path: the file, .html.
         gaussians: [N].
         cameras: [V], in the order of the path on which the page moves; it opens at the first.
-        names: of the V photographs, to show; none: numbers.
-        title: of the page; none: the file's name.
+        names: photographs' names, one a camera; empty: the page shows numbers.
+        title: the page's title; empty: the file's name.
         background: RGB behind the Gaussians.
         antialiased: see `render`.
 

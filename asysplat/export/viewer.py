@@ -170,8 +170,8 @@ class Viewer:
         self._min_opacity = gui.add_slider("Minimum opacity", 0.0, 1.0, 0.01, 0.0)
         self._size = gui.add_slider("Size", 0.05, 1.0, 0.05, 1.0)
         self._antialiased = gui.add_checkbox("Antialiased", antialiased)
-        self._settings = (self._layer, self._sh_degree, self._min_opacity, self._size)
-        self._settings += (self._antialiased,)
+        sliders = (self._sh_degree, self._min_opacity, self._size)
+        self._settings = (self._layer, *sliders, self._antialiased)
         for handle in self._settings:
             handle.on_update(lambda _: self._change())
         self._show_cameras = gui.add_checkbox("Cameras", True)

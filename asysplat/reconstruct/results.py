@@ -56,6 +56,7 @@ class Results:
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
         self._suffixes = [*read_outputs(config.output), Path(SCENE).suffix]
+        self._suffixes.sort(key=lambda suffix: suffix == PAGE)  # the scene's files first
         if config.open and PAGE not in self._suffixes:
             raise InputError("open=true opens the page, which output= leaves out: add html to it.")
         check_video(config.video)

@@ -29,8 +29,8 @@ class Reconstruction(NamedTuple):
 
     folder: Path
     finished: float  # time
-    results: dict[str, int | float | None]  # of metrics.json, what is shown
-    options: dict[str, Any]  # of config.yaml, by dotted keys
+    results: dict[str, int | float | None]  # numbers of metrics.json that are shown
+    options: dict[str, Any]  # options of config.yaml, by dotted keys
     sizes: dict[str, int]  # bytes of its files, by name
 
 

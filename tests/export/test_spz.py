@@ -96,7 +96,7 @@ def test_damaged_files_are_refused(make_scene, file):
         (b"ply\n", "cannot be unpacked .* no SPZ file"),
         (gzip.compress(plain[:-1]), "is cut off or damaged: 108 bytes were expected where 107"),
         (gzip.compress(plain)[:-20], "cannot be unpacked"),
-        (gzip.compress(b"XXXX" + plain[4:]), "is not an SPZ file: expected NGSP"),
+        (gzip.compress(b"PLYS" + plain[4:]), "is not an SPZ file: expected NGSP"),
         (gzip.compress(changed(plain, 4, "<I", 1)), "has the version 1: expected 2 to 4"),
         (gzip.compress(changed(plain, 4, "<I", 9)), "has the version 9: expected 2 to 4"),
         (gzip.compress(changed(plain, 8, "<I", 0)), "has no Gaussians"),

@@ -22,7 +22,6 @@ from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 
-SUFFIX = ".compressed.ply"
 CHUNK = 256  # Gaussians that share their ranges
 RANGES = [
     f"{end}_{axis}"

@@ -1,5 +1,7 @@
 """Gaussians as safetensors, with metadata."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -41,15 +43,9 @@ def read_safetensors(
         InputError: no such file, a missing field, or invalid Gaussians.
     """
     path = require_file(path)
-    try:
-        with safe_open(path, "pt") as file:
-            tensors = {name: file.get_tensor(name).to(dtype) for name in file.keys()}  # noqa: SIM118
-            metadata = file.metadata() or {}
-    except SafetensorError as error:
-        raise InputError(
-            f"{path} cannot be read as safetensors ({error}): it is cut off or of another format; "
-            "copy it again."
-        ) from error
+    with _open(path) as file:
+        tensors = {name: file.get_tensor(name).to(dtype) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata() or {}
     if missing := [name for name in NAMES if name not in tensors]:
         raise InputError(
             f"{path} has no {', '.join(missing)}: expected the fields {', '.join(NAMES)} of a "
@@ -65,3 +61,25 @@ def read_safetensors(
             f"{path} has opacities of shape {shape}: expected [N], one Gaussian or more."
         )
     return gaussians.validate(f"{path}: Gaussians"), metadata
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """Read the metadata of a file alone, without its tensors.
+
+    Raises:
+        InputError: no such file, or a damaged one.
+    """
+    with _open(require_file(path)) as file:
+        return file.metadata() or {}
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[safe_open]:
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except SafetensorError as error:
+        raise InputError(
+            f"{path} cannot be read as safetensors ({error}): it is cut off or of another format; "
+            "copy it again."
+        ) from error
