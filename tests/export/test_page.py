@@ -275,10 +275,12 @@ def test_a_double_click_sets_the_point_to_orbit(browser, make_scene, tmp_path):
     tab = browser.open(tmp_path / "scene.html", WIDTH, HEIGHT)
     tab.evaluate("asysplat.ready")
     (x, y), *_ = cameras.project(gaussians.means)[0][0].tolist()
+    tab.evaluate("void addEventListener('dblclick', () => { window.clicked = true; })")
     for clicks in (1, 2):
         click = {"button": "left", "clickCount": clicks}
         tab.mouse("mousePressed", x, y, **click)
         tab.mouse("mouseReleased", x, y, **click)
+    tab.wait("window.clicked")  # a busy browser may handle the wheel first
     before, axes = camera(tab)
     tab.mouse("mouseWheel", x, y, deltaX=0, deltaY=-300)
     offset = axes @ (camera(tab)[0] - before)
