@@ -34,6 +34,7 @@ async function start() {
   element("controls").hidden = path.length < 2;
   show(0);
   await sort();
+  resize(); // now, as the observer may come after the first click
   new ResizeObserver(resize).observe(canvas);
   element("message").hidden = true;
 }
