@@ -120,32 +120,35 @@ def unpack(path: Path, elements: dict[str, ndarray]) -> Gaussians:
         )
     )
     rgb = _within(ranges[:, 2], color[:, :3]) if len(names) == len(RANGES) else color[:, :3]
+    color_sh = (torch.from_numpy(rgb) - 0.5).div(SH_C0).float()
     largest = (3 * rotation[:, 0]).round().astype(np.int64)
     gaussians = Gaussians(
         means=torch.from_numpy(_within(ranges[:, 0], position)).float(),
         quats=join_largest(largest, (rotation[:, 1:] - 0.5) * 2**0.5).float(),
         scales=torch.from_numpy(_within(ranges[:, 1], scale)).exp().float().clamp_min(TINY),
         opacities=torch.from_numpy(color[:, 3]).float().clamp_min(TINY),
-        sh=torch.cat(((torch.from_numpy(rgb)[:, None] - 0.5) / SH_C0, _rest(path, elements)), 1),
+        sh=torch.cat((color_sh[:, None], _rest(path, elements)), 1),
     )
-    return gaussians.map(torch.Tensor.float).validate(f"{path}: Gaussians")
+    return gaussians.validate(f"{path}: Gaussians")
 
 
 def _rest(path: Path, elements: dict[str, ndarray]) -> Float[Tensor, "N K 3"]:
     """Compute SH above degree 0 from the element sh."""
     count, rows = len(elements["vertex"]), elements.get("sh")
     if rows is None:
-        return torch.zeros(count, 0, 3, dtype=torch.float64)
+        return torch.zeros(count, 0, 3)
     names = [f"f_rest_{i}" for i in range(len(rows.dtype.names))]
     if len(rows) != count or len(names) not in REST_COUNTS:
         raise InputError(
             f"{path} has {len(rows)} rows of {len(names)} properties in its element sh: expected "
             f"{count} rows of {' or '.join(map(str, REST_COUNTS))}; copy it again."
         )
-    steps = torch.from_numpy(_columns(path, "sh", rows, names, np.uint8)).double()
     # The first and the last step reach the ends of the range, the others stand for their middle.
-    places = torch.where(steps == 0, 0, torch.where(steps == 255, 1, (steps + 0.5) / 256))
-    return (SH_RANGE * (places - 0.5)).unflatten(1, (3, -1)).mT
+    places = (torch.arange(256, dtype=torch.float64) + 0.5) / 256
+    places[0], places[-1] = 0, 1
+    values = (SH_RANGE * (places - 0.5)).float()
+    steps = torch.from_numpy(_columns(path, "sh", rows, names, np.uint8))
+    return values[steps.int()].unflatten(1, (3, -1)).mT
 
 
 def _columns(

@@ -44,7 +44,6 @@ def write_ply(
         offset: to be added to the means, which float32 may not resolve: written as a comment,
             `comment offset X Y Z`, if it is not 0.
         background: RGB in [0, 1] behind the Gaussians, if known: written as a comment likewise.
-
         antialiased: as for `render`.
 
     Raises:
