@@ -38,6 +38,7 @@ from asysplat.reconstruct.video import find_views
 from asysplat.refinement import RefinementSettings, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
+from asysplat.runs.device import find_device
 from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
 
@@ -57,6 +58,7 @@ def reconstruct(config: DictConfig) -> None:
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
     settings = instantiate(config.refinement)
+    device = find_device(config.device)
     results = Results(Path(config.paths.run), config)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     options = {name: config[name] for name in names}
@@ -65,6 +67,7 @@ def reconstruct(config: DictConfig) -> None:
     photographs = open_photographs(config.path, **options)
     find_views(config.video, photographs)  # an error of names comes before the work
     print(describe(config, photographs, limit))
+    photographs = photographs.to(device)
     gaussians = initialize(config, photographs, settings)
     background = photographs.inputs.mean_color()
     results.save_start(gaussians, photographs, background)
@@ -135,13 +138,14 @@ def read_limit(config: DictConfig) -> dict[str, float]:
 def initialize(
     config: DictConfig, photographs: Photographs, settings: RefinementSettings
 ) -> Gaussians:
-    """Build the Gaussians to refine, in the network's frame."""
-    init, network = config.init, None
+    """Build the Gaussians to refine, in the network's frame, on the photographs' device."""
+    init, network, device = config.init, None, photographs.inputs.images.device
     if init == "network":
-        network = load(config.checkpoint)
+        network = load(config.checkpoint).to(device)
         network.early_exit = instantiate(config.speed)
     if init not in INITS and Path(str(init)).suffix:
-        gaussians = photographs.normalization.to_network(read_gaussians(init, photographs.origin))
+        gaussians = read_gaussians(init, photographs.origin).to(device)
+        gaussians = photographs.normalization.to_network(gaussians)
     else:
         gaussians = initial_gaussians(init, photographs, settings, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")

@@ -21,9 +21,10 @@ from asysplat.evaluation.static_cost import count_parameters
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
+from asysplat.runs.device import find_device
 from asysplat.scene import Gaussians, Views
 from benchmarks.compare import TIME, Watched
-from benchmarks.options import PRECISIONS, check_names, find_device
+from benchmarks.options import PRECISIONS, check_names
 from benchmarks.plot import bars
 from benchmarks.scenes import on_an_arc, random_scene
 from benchmarks.table import machine_note, make_table, median_iqr_column, number, text

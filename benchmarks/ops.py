@@ -14,10 +14,11 @@ from torch import Tensor
 from asysplat import ops
 from asysplat.errors import InputError
 from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.runs.device import find_device
 from asysplat.scene import Cameras
 from benchmarks import timing
 from benchmarks.compare import ERROR, TIME, Watched
-from benchmarks.options import PRECISIONS, check_names, find_device
+from benchmarks.options import PRECISIONS, check_names
 from benchmarks.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
 from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, relative_l2

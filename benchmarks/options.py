@@ -34,18 +34,6 @@ def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None
             raise InputError(f"{option}={name} is unknown: choose from {', '.join(known)}.")
 
 
-def find_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the GPU where there is one.
-
-    Raises:
-        InputError: another name, or a GPU where there is none.
-    """
-    check_names("device", [name], ("auto", "cpu", "cuda"))
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("device=cuda is not there: torch finds no GPU; take device=cpu.")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
 def describe_machine() -> dict[str, str | int]:
     """Return the processor, cores, torch's threads, the GPU if any, and versions of packages."""
     machine = {

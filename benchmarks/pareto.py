@@ -43,10 +43,11 @@ from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.rendering import INRIA, render
 from asysplat.report.front import draw_front
 from asysplat.report.style import FAINT, OURS, STYLE
+from asysplat.runs.device import find_device
 from asysplat.scene import Views
 from benchmarks import timing
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
-from benchmarks.options import CPU, PRECISIONS, check_names, find_device
+from benchmarks.options import CPU, PRECISIONS, check_names
 from benchmarks.table import Columns, machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, summary
 

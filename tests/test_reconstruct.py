@@ -21,6 +21,7 @@ import yaml
 from full_disk import largest_file
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from pretend_device import DEVICE, pretended_device
 from safetensors import safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
@@ -84,6 +85,31 @@ def numbers_of(folder):
 def rows_of(folder):
     with (folder / "metrics.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("init", ["plane_sweep", "network"])
+def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, monkeypatch, init):
+    def find(name):
+        assert name == "auto"
+        return DEVICE
+
+    options = ("steps=3", "refinement.max_gaussians=300", "views=4", "height=24")
+    options += ("video.path=orbit", f"init={init}")
+    finished(command(photographs, *options))
+    expected = numbers_of(tmp_path / "run")
+    monkeypatch.setattr("asysplat.runs.device.find_device", find)
+    with pretended_device(monkeypatch):
+        finished(command(photographs, *options))
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
+    numbers = numbers_of(tmp_path / "run")
+    # In float32 a kernel and torch's operators part after some steps of Adam.
+    for name, tolerance in {
+        "inputs/psnr": 0.01,
+        "held_out/psnr": 0.01,
+        "held_out/absrel": 0.05,
+    }.items():
+        assert numbers[name] == pytest.approx(expected[name], rel=tolerance)
 
 
 @pytest.mark.medium

@@ -50,6 +50,15 @@ class Photographs:
             cam_to_world=torch.cat([cameras.cam_to_world for cameras in parts]),
         )
 
+    def to(self, device: torch.device) -> "Photographs":
+        """Return the photographs with views and points on a device."""
+        return replace(
+            self,
+            inputs=self.inputs.to(device),
+            held_out=None if self.held_out is None else self.held_out.to(device),
+            points=None if self.points is None else self.points.to(device),
+        )
+
     def all_views(self) -> Views:
         """Return the inputs and the held-out views as one, without depths."""
         parts = [views for views in (self.inputs, self.held_out) if views is not None]

@@ -309,7 +309,9 @@ def draw_layer(
     opacities = opacities.where(opacities >= min_opacity, 0)
     gaussians = replace(gaussians, scales=size * gaussians.scales, opacities=opacities)
     options = {"sh_degree": sh_degree, "antialiased": antialiased}
-    rendering = render(gaussians, camera, depth=layer == "depth", **options)
+    rendering = render(
+        gaussians, camera.to(gaussians.means.device), depth=layer == "depth", **options
+    )
     if layer == "depth":
         values = disparity(rendering.depth[0])
         sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]

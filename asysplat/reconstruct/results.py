@@ -85,6 +85,8 @@ class Results:
             self.folder, OTHER_BYTES + len(self._suffixes) * count * BYTES_PER_GAUSSIAN
         )
         self._photographs, self._background = photographs, background
+        if self._lpips is not None:
+            self._lpips.to(background.device)
         self._save_contact_sheet("start.png", gaussians)
         print(f"figure: {self.folder / 'start.png'}")
 
@@ -102,7 +104,9 @@ class Results:
             if suffix != PAGE:
                 save_gaussians(path, world, notes)
                 continue
-            cameras = photographs.normalization.cameras_to_world(photographs.inputs.cameras)
+            cameras = photographs.normalization.cameras_to_world(
+                photographs.inputs.cameras.to("cpu")
+            )
             names = [Path(file).name for file in photographs.input_files]
             write_page(path, world, cameras, names, Path(self._config.path).name, background)
 
@@ -147,7 +151,7 @@ class Results:
         """Write the cameras of inputs and held-out views in the world of the scene files."""
         photographs = self._photographs
         files = map(os.path.abspath, photographs.input_files + photographs.held_out_files)
-        cameras = photographs.normalization.cameras_to_world(photographs.cameras)
+        cameras = photographs.normalization.cameras_to_world(photographs.cameras.to("cpu"))
         with atomic_write(self.folder / CAMERAS) as path:
             path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 

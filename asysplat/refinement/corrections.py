@@ -18,9 +18,10 @@ class Corrections:
     offset and motion at 0. A correction with rate 0 is off.
     """
 
-    def __init__(self, count: int, rates: Rates):
+    def __init__(self, count: int, rates: Rates, device: torch.device):
         self._rates = {"exposure": rates.exposure, "poses": rates.poses}
-        self._adam = SelectiveAdam({n: torch.zeros(count, 2, 3) for n in self._rates}, eps=1e-8)
+        zeros = {name: torch.zeros(count, 2, 3, device=device) for name in self._rates}
+        self._adam = SelectiveAdam(zeros, eps=1e-8)
 
     def leaves(self) -> dict[str, Float[Tensor, "V 2 3"]]:
         """Return the parameters of all images as leaves of a graph; none if both are off."""
@@ -29,9 +30,10 @@ class Corrections:
 
     def step(self, view: int, gradients: dict[str, Tensor], factor: float) -> None:
         """Update the parameters of one image, then subtract the mean over all images."""
-        visible = torch.arange(self._adam.num_rows) == view
+        parameters = self._adam.parameters
+        visible = torch.arange(self._adam.num_rows, device=parameters["poses"].device) == view
         self._adam.step(gradients, {n: rate * factor for n, rate in self._rates.items()}, visible)
-        for tensor in self._adam.parameters.values():
+        for tensor in parameters.values():
             tensor -= tensor.mean(0)
 
 

@@ -120,7 +120,7 @@ def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussia
     sizes = footprints(points, views.cameras)  # the minimum: for lone or coincident points
     if len(points) > 1:
         ranks = range(2, min(NEIGHBORS + 1, len(points)) + 1)  # the first is the point itself
-        distances = KDTree(points.numpy()).query(points.numpy(), k=list(ranks))[0]
+        distances = KDTree(points.cpu()).query(points.cpu(), k=list(ranks))[0]
         sizes = torch.maximum(sizes, torch.as_tensor(distances.mean(-1)).to(points))
     opacities = torch.full_like(sizes, POINT_OPACITY)
     return isotropic_gaussians(points, sizes, opacities, sample_colors(points, views))

@@ -36,7 +36,7 @@ def merge_cells(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
     log_transmittance = torch.log1p(-gaussians.opacities.clamp(max=0.999))
     opacities = 1 - weights.new_zeros(count).index_add_(0, cell, log_transmittance).exp()
     # q and -q are the same rotation: flip all quaternions of a cell to the side of its first.
-    rows = torch.arange(len(cell))
+    rows = torch.arange(len(cell), device=cell.device)
     first = rows.new_full((count,), len(cell)).scatter_reduce_(0, cell, rows, "amin")[cell]
     quats = F.normalize(gaussians.quats, dim=-1)
     opposite = (quats * quats[first]).sum(-1, keepdim=True) < 0

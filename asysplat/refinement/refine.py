@@ -16,10 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.kernels.dispatch import check_device
 from asysplat.ops.image_loss import image_loss
 from asysplat.refinement.corrections import Corrections, correct_exposure, correct_poses
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification.densifier import Densifier, random_permutation
 from asysplat.refinement.densification.relocate import McmcDensifier
 from asysplat.refinement.densification.spawn import ErrorDensifier
 from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
@@ -51,7 +52,7 @@ class Refinement:
         seed: seed of the order of views and of new Gaussians.
 
     Raises:
-        InputError: no Gaussians, or invalid values.
+        InputError: no Gaussians, invalid values, or views on another device.
     """
 
     def __init__(
@@ -66,11 +67,12 @@ class Refinement:
             raise InputError("refine got no Gaussians: start from at least one.")
         gaussians.validate("refine's gaussians")
         self.views = views.validate("refine's views")
+        check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings = settings
         self.background = views.mean_color() if background is None else background
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator(gaussians.means.device).manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
-        self.corrections = Corrections(views.num_views, settings.rates)
+        self.corrections = Corrections(views.num_views, settings.rates, views.images.device)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = self._random_order()
@@ -166,7 +168,7 @@ class Refinement:
     def _random_order(self) -> Iterator[int]:
         """Yield views in a random order; all are used before one is used again."""
         while True:
-            yield from torch.randperm(self.views.num_views, generator=self._generator).tolist()
+            yield from random_permutation(self.views.num_views, self._generator).tolist()
 
     def _units(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         if self.settings.rates.unit == "scene":

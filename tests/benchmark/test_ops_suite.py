@@ -5,8 +5,9 @@ import math
 import pytest
 
 from asysplat.errors import InputError
+from asysplat.runs.device import find_device
 from benchmarks.ops import PASSES, SCANS
-from benchmarks.options import CPU, PRECISIONS, check_names, find_device
+from benchmarks.options import CPU, PRECISIONS, check_names
 
 pytestmark = pytest.mark.medium
 

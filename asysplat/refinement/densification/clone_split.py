@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification.densifier import Densifier, random_normal
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
 from asysplat.scene import Cameras, Views
@@ -63,7 +63,7 @@ class ScreenGradients:
         self._reset()
 
     def _reset(self) -> None:
-        self._sums, self._counts, self._radii = torch.zeros(3, len(self.fields))
+        self._sums, self._counts, self._radii = self.fields.units.new_zeros(3, len(self.fields))
 
     @property
     def mean(self) -> Float[Tensor, "N"]:
@@ -118,7 +118,7 @@ class ScreenGradients:
         cloned, split = (torch.nonzero(selected & rows)[:, 0] for rows in (~large, large))
         twice = split.repeat(2)
         halves = gaussians.map(lambda field: field[twice])
-        noise = halves.scales * torch.randn(len(twice), 3, generator=generator)
+        noise = halves.scales * random_normal(len(twice), 3, generator)
         shift = (rotations(halves.quats) @ noise[..., None])[..., 0]
         halves = replace(halves, means=halves.means + shift, scales=halves.scales / SPLIT_FACTOR)
         units = fields.units

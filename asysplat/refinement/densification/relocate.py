@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification.densifier import Densifier, random_normal
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
 from asysplat.scene import Gaussians, Views
@@ -64,7 +64,8 @@ def relocate(fields: Fields, target: int, generator: torch.Generator) -> None:
     if alive.any():
         _copy(fields, alive.nonzero()[:, 0], int((~alive).sum()), generator)
     count = len(fields)
-    _copy(fields, torch.arange(count), max(0, target - count), generator)
+    every = torch.arange(count, device=fields.units.device)
+    _copy(fields, every, max(0, target - count), generator)
 
 
 @torch.no_grad()
@@ -77,7 +78,7 @@ def inject_position_noise(fields: Fields, factor: float, generator: torch.Genera
     faint = torch.nonzero(gaussians.opacities < NOISE_MAX_OPACITY)[:, 0]
     gaussians = gaussians.map(lambda field: field[faint])
     gate = torch.sigmoid(SHARPNESS * (MIN_OPACITY - gaussians.opacities))
-    noise = torch.randn(len(faint), 3, generator=generator) * (NOISE * factor * gate)[:, None]
+    noise = random_normal(len(faint), 3, generator) * (NOISE * factor * gate)[:, None]
     axes = rotations(gaussians.quats) * gaussians.scales[:, None]
     shift = axes @ (axes.mT @ noise[..., None])
     fields.parameters["offsets"][faint] += shift[..., 0] / fields.units[faint, None]

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification.densifier import Densifier, random_permutation
 from asysplat.refinement.fields import Fields
 from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.rendering import render
@@ -39,7 +39,7 @@ class ErrorDensifier(Densifier):
     ):
         self.fields, self.generator, self.background = fields, generator, background
         self.units, self._steps = units, 0
-        self._last_visible = torch.zeros(len(fields), dtype=torch.long)
+        self._last_visible = torch.zeros_like(fields.units, dtype=torch.long)
 
     def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
         self._steps += 1
@@ -57,7 +57,7 @@ class ErrorDensifier(Densifier):
         self._last_visible = self._last_visible[rows]
         count = target - len(self.fields)
         if count > 0:
-            order = torch.randperm(views.num_views, generator=self.generator)
+            order = random_permutation(views.num_views, self.generator)
             views, gaussians = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
             cameras = (views.cameras.select([view]) for view in range(views.num_views))
             outs = [
@@ -97,7 +97,8 @@ def spawn_at_errors(
     count = min(count, int((error > 0).sum()))
     # torch.multinomial is limited to 2^24 pixels. The smallest of exponential times with these
     # rates sample the same distribution (Efraimidis and Spirakis 2006).
-    times = torch.empty(error.shape).exponential_(generator=generator).clamp_min(1e-30)
+    times = torch.empty(error.shape, device=error.device)
+    times = times.exponential_(generator=generator).clamp_min(1e-30)
     sampled = (error / times.to(error)).flatten().topk(count).indices
     cameras = views.cameras
     view = sampled // error[0].numel()

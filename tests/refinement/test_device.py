@@ -1,0 +1,60 @@
+"""Refinement on a device other than the CPU: nothing is left behind on the CPU."""
+
+import pytest
+import torch
+from pretend_device import DEVICE, pretended_device
+
+from asysplat.errors import InputError
+from asysplat.refinement import Rates, RefinementSettings, StepSchedule, refine
+from asysplat.refinement.isotropic import isotropic_gaussians
+from asysplat.scene import Cameras, Views
+
+
+@pytest.fixture
+def scene():
+    """Gaussians, and photographs of noise with masks."""
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.linspace(-1, 1, 3)
+    matrix = torch.tensor([[15.0, 0, 7.5], [0, 15, 6], [0, 0, 1]])
+    images = torch.rand(3, 3, 12, 15)
+    masks = torch.rand(3, 12, 15) > 0.1
+    views = Views(Cameras(matrix.repeat(3, 1, 1), poses, 12, 15), images, masks=masks)
+    means = torch.rand(60, 3) + torch.tensor([-0.5, -0.5, 2])
+    sizes, opacities = torch.full((60,), 0.1), torch.linspace(0.001, 0.9, 60)
+    return isotropic_gaussians(means, sizes, opacities, torch.rand(60, 3)), views
+
+
+def watched(gaussians, views, settings):
+    """Refine, and return the last progress, too."""
+    progress = []
+    found = refine(gaussians, views, settings, steps=12, watch=lambda now, _: progress.append(now))
+    return found, progress[-1]
+
+
+@pytest.mark.parametrize("densify", ["error", "mcmc", "gradient", "none"])
+def test_a_refinement_runs_where_its_inputs_are(scene, monkeypatch, densify):
+    gaussians, views = scene
+    schedule = StepSchedule(first_round=2, round=2, opacity_reset=5, sh_degree=2)
+    settings = RefinementSettings(
+        densify=densify,
+        max_gaussians=100,
+        ssim=0.2,
+        every=schedule if densify == "gradient" else None,
+        rates=Rates(exposure=1e-3, poses=1e-4),
+    )
+    expected, status = watched(gaussians, views, settings)
+    with pretended_device(monkeypatch) as device:
+        found, status_there = watched(gaussians.to(device), views.to(device), settings)
+    assert found.means.device == DEVICE
+    # In float32 a kernel and torch's operators part after some steps of Adam.
+    assert status_there.psnr == pytest.approx(status.psnr, abs=0.02)
+    assert status_there.gaussians == status.gaussians == expected.num_gaussians
+
+
+def test_inputs_on_two_devices_are_refused(scene, monkeypatch):
+    gaussians, views = scene
+    with (
+        pretended_device(monkeypatch) as device,
+        pytest.raises(InputError, match=r"^refine's views is on cpu and gaussians on mps"),
+    ):
+        refine(gaussians.to(device), views, steps=1)
