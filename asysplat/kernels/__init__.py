@@ -1,1 +1,1 @@
-"""What kernels are made of and how one is chosen, for operators and renderer alike."""
+"""Building blocks of kernels, and the choice of a backend, for the operators and the renderer."""

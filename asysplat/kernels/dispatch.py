@@ -11,12 +11,14 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 
-Form = TypeVar("Form")
-FAST = ("cpu", "cuda")  # backends made of kernels
+Implementation = TypeVar("Implementation")
+KERNEL_BACKENDS = ("cpu", "cuda")  # the backends that run kernels; the others are written in torch
 
 
-def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> Form:
-    """Return the function or module of a backend.
+def look_up_backend(
+    operator: str, backends: Mapping[str, Implementation], backend: str
+) -> Implementation:
+    """Return the entry of `backends` with the name `backend`.
 
     Raises:
         InputError: an unknown name; the message lists the known ones.
@@ -26,36 +28,36 @@ def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> F
     return backends[backend]
 
 
-def fast_backend(x: Tensor, in_torch: str) -> str:
-    """Return the name of the fastest backend for the device and type of x.
+def choose_fastest(x: Tensor, fallback: str) -> str:
+    """Return the name of the fastest backend for the device and dtype of x.
 
     Args:
-        in_torch: the name of the backend for any device and type.
+        fallback: name of the backend in torch, which takes every device and dtype.
     """
     if x.dtype == torch.float64:
-        return in_torch
+        return fallback
     if x.device.type in ("cpu", "meta"):
         return "cpu"
-    return "cuda" if x.device.type == "cuda" and find_spec("triton") else in_torch
+    return "cuda" if x.device.type == "cuda" and find_spec("triton") else fallback
 
 
 def load_kernels(operator: str, backend: str) -> ModuleType:
-    """Import an operator's kernels when they are first used: Numba and Triton load slowly."""
+    """Import an operator's kernels only when they are used: Numba and Triton load slowly."""
     return import_module(f"asysplat.ops.{operator}.{backend}")
 
 
-def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:
-    """Check that the kernels of `backend` can run on x here.
+def check_kernel_backend(operator: str, backend: str, x: Tensor) -> None:
+    """Check that the kernels of `backend` can run on x.
 
     Raises:
-        InputError: float64, another device, or no Triton.
+        InputError: x is float64 or on another device, or Triton is not installed.
     """
     if x.dtype == torch.float64:
         raise InputError(
             f"{operator}'s backend {backend!r} computes in float32 and x is float64: choose "
             "'auto', or give float32."
         )
-    if x.device.type not in (backend, "meta") and not _interpreted(backend):
+    if x.device.type not in (backend, "meta") and not _uses_interpreter(backend):
         raise InputError(
             f"{operator}'s backend is {backend!r} and x is on {x.device}: choose 'auto', or move "
             f"it with .to('{backend}')."
@@ -65,7 +67,13 @@ def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:
 
 
 def check_shape(operator: str, name: str, tensor: Tensor, shape: object, reason: str = "") -> None:
-    """Raise InputError unless a tensor has this shape; `reason` follows in the message."""
+    """Raise InputError unless a tensor has the expected shape.
+
+    Args:
+        shape: expected shape; a string, such as "[B, V, H, W]", equals no tensor's: it is for a
+            tensor whose number of dimensions is known to be wrong.
+        reason: continuation of the message after the expected shape.
+    """
     if tuple(tensor.shape) != shape:
         raise InputError(
             f"{operator}'s {name} has shape {tuple(tensor.shape)}: expected {shape}{reason}."
@@ -73,7 +81,7 @@ def check_shape(operator: str, name: str, tensor: Tensor, shape: object, reason:
 
 
 def check_device(operator: str, name: str, tensor: Tensor, first: str, like: Tensor) -> None:
-    """Raise InputError unless a tensor is on the device of the argument `first`."""
+    """Raise InputError unless a tensor is on the device of `like`, the argument named `first`."""
     if tensor.device != like.device:
         raise InputError(
             f"{operator}'s {name} is on {tensor.device} and {first} on {like.device}: move both "
@@ -82,14 +90,14 @@ def check_device(operator: str, name: str, tensor: Tensor, first: str, like: Ten
 
 
 def check_float(operator: str, name: str, tensor: Tensor, advice: str = "") -> None:
-    """Raise InputError unless a tensor has floating-point numbers."""
+    """Raise InputError unless a tensor has floating-point numbers; `advice` ends the message."""
     if not tensor.is_floating_point():
         raise InputError(
             f"{operator}'s {name} is {tensor.dtype}: give floating-point numbers{advice}."
         )
 
 
-def _interpreted(backend: str) -> bool:
+def _uses_interpreter(backend: str) -> bool:
     """Return whether Triton interprets its kernels on a CPU, as in tests."""
     if backend != "cuda" or not find_spec("triton"):
         return False

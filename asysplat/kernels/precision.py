@@ -1,4 +1,4 @@
-"""Computations that autocast must not round to half precision."""
+"""Protection of computations that autocast must not round to half precision."""
 
 from contextlib import AbstractContextManager, nullcontext
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def without_autocast(tensor: Tensor) -> AbstractContextManager:
-    """Switch autocast off on the tensor's device; the meta device has none."""
+    """Return a context without autocast on the tensor's device; the meta device has no autocast."""
     if tensor.device.type == "meta":
         return nullcontext()
     return torch.autocast(tensor.device.type, enabled=False)

@@ -1,4 +1,4 @@
-"""Helpers of the GPU kernels (Triton): how they are compiled, and token indices."""
+"""Helpers of the GPU kernels (Triton): compilation, and the tokens at positions of a scan."""
 
 import inspect
 from collections.abc import Callable
@@ -6,20 +6,20 @@ from collections.abc import Callable
 import triton
 import triton.language as tl
 
-INTERPRETED = triton.knobs.runtime.interpret  # Triton runs on a CPU, in NumPy: for tests
-# A launch may fuse products and sums where no kernel decides between two results. The renderer
-# switches this off at every launch: both of its passes must take identical decisions.
+INTERPRETED = triton.knobs.runtime.interpret  # True in tests on a CPU, where NumPy runs the kernels
+# Launch option: a product and a sum may become one fused multiply-add. The renderer forbids it, as
+# its two passes must round alike to take the same decisions; no operator's kernels depend on that.
 FUSED = {"enable_fp_fusion": True}
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile a function, without the wrapper of a type checker."""
+    """Compile a function as a kernel, without the wrapper that a type checker put around it."""
     return triton.jit(inspect.unwrap(function))
 
 
 @kernel
 def tokens_at(position, length, REVERSE: tl.constexpr):
-    """Return the indices (int64) of the tokens at scan positions, and which of them exist."""
+    """Return the indices (int64) of the tokens at positions of a scan, and which of them exist."""
     position = tl.cast(position, tl.int64)
     token = length - 1 - position if REVERSE else position
     return token, position < length

@@ -1,9 +1,9 @@
-"""The operators in which training and reconstruction spend their time.
+"""The operators in which training and reconstruction spend most of their time.
 
-Each is a folder: `reference.py` reads like the formula and takes float64; cpu (Numba) and cuda
-(Triton) hold the kernels, tested against it; `__init__.py` chooses. The scans also have
-`chunked.py`, a fast form in torch; of their kernels `scan.py` runs both passes, `forward.py` and
-`backward.py` hold those of each pass, and `chunk.py` what these share.
+Each operator is a folder. `reference.py` computes the formula in torch, in float64 too; cpu (Numba)
+and cuda (Triton) hold kernels, which are tested against it; `__init__.py` chooses one of them. The
+scans also have `chunked.py`, a fast implementation in torch. Their kernels are in `forward.py` and
+`backward.py`, one file per pass; `chunk.py` holds what the passes share, and `scan.py` runs both.
 """
 
 from asysplat.ops.grid_attention import grid_attention

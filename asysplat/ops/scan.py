@@ -1,12 +1,13 @@
 """The common parts of both scans: checks, the choice of a backend, and their operators in torch.
 
-"reference" and "chunked" are functions in torch. "cpu" and "cuda" are modules of kernels, in which
-x, B and C have the same float type; torch sees them as one operator, so that autograd,
-torch.compile, autocast, the meta device and the FLOP counter take a scan as a whole:
+The backends "reference" and "chunked" are functions in torch. "cpu" and "cuda" are modules of
+kernels, registered as one operator, which autograd, torch.compile, autocast, the meta device and
+the FLOP counter see whole. They take x, B and C of one float type and define:
 
     forward(inputs, reverse, keep) -> y and the saved state, whose sides are 0 unless `keep`
     backward(grad_output, inputs, saved_state, reverse) -> the gradients, as ScanInputs
-    saved_state_shape(x, B) -> the shape of what the backward pass needs besides the inputs, in fp32
+    saved_state_shape(x, B) -> the shape of the saved state, which is what the backward pass needs
+        besides the inputs, in fp32
 """
 
 import warnings
@@ -20,18 +21,18 @@ from torch.utils.flop_counter import register_flop_formula
 
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import (
-    FAST,
+    KERNEL_BACKENDS,
     check_device,
-    check_fast_backend,
     check_float,
+    check_kernel_backend,
     check_shape,
-    fast_backend,
+    choose_fastest,
     load_kernels,
-    pick_backend,
+    look_up_backend,
 )
 from asysplat.kernels.precision import without_autocast
 
-SIDES = {"P": "head_dim", "N": "state size"}  # in messages
+AXIS_NAMES = {"P": "head_dim", "N": "state size"}  # names in messages
 CountFlops = Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]]
 
 
@@ -51,21 +52,21 @@ class Scan:
 
     Args:
         name: "ssd" or "selective_scan".
-        axes: axes of each input, such as "B L N"; those of x and N give all sizes.
-        forms: the functions in torch, by name.
+        axes: axes of each input, such as "B L N"; the shape of x and N determine all sizes.
+        torch_backends: functions in torch, by the name of their backend.
         count_flops: (shape of x, shape of B) -> FLOPs of the forward and of the backward pass.
-        largest: the sides that "cuda" takes as powers of two, from 16 to this size.
+        largest: greatest sizes of the axes whose size must be a power of two from 16 on for "cuda".
     """
 
     def __init__(
         self,
         name: str,
         axes: Mapping[str, str],
-        forms: Mapping[str, Callable[[ScanInputs], Tensor]],
+        torch_backends: Mapping[str, Callable[[ScanInputs], Tensor]],
         count_flops: CountFlops,
         largest: Mapping[str, int],
     ):
-        self.name, self.forms, self.largest = name, forms, largest
+        self.name, self.torch_backends, self.largest = name, torch_backends, largest
         self.axes = {key: value.split() for key, value in axes.items()}
         self.run_kernels = _register_operator(name, count_flops)
 
@@ -78,13 +79,13 @@ class Scan:
         """
         self._check(inputs)
         if backend == "auto":
-            backend = fast_backend(inputs.x, "chunked")
+            backend = choose_fastest(inputs.x, "chunked")
             if backend == "cuda" and (misfit := self._misfit(inputs)):
                 warnings.warn(f"{misfit}: computed by 'chunked', which is slower.", stacklevel=2)
                 backend = "chunked"
         with without_autocast(inputs.x):
-            if backend in FAST:
-                check_fast_backend(self.name, backend, inputs.x)
+            if backend in KERNEL_BACKENDS:
+                check_kernel_backend(self.name, backend, inputs.x)
                 if backend == "cuda" and (misfit := self._misfit(inputs)):
                     raise InputError(f"{misfit}; change it, or choose backend 'chunked'.")
                 keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
@@ -94,25 +95,25 @@ class Scan:
                     for name, tensor in inputs._asdict().items()
                 )
                 return self.run_kernels(backend, *tensors, reverse=reverse, keep=keep)[0]
-            backends = {"auto": None, **self.forms, **dict.fromkeys(FAST)}
-            form = pick_backend(self.name, backends, backend)
+            backends = {"auto": None, **self.torch_backends, **dict.fromkeys(KERNEL_BACKENDS)}
+            implementation = look_up_backend(self.name, backends, backend)
             dtype = torch.promote_types(inputs.x.dtype, torch.float32)
             arguments = ScanInputs(*(tensor.to(dtype) for tensor in inputs))
             if not reverse:
-                return form(arguments).to(inputs.x.dtype)
+                return implementation(arguments).to(inputs.x.dtype)
             x, dt, A, B, C, D = arguments
             flipped = ScanInputs(x.flip(1), dt.flip(1), A, B.flip(1), C.flip(1), D)
-            return form(flipped).flip(1).to(inputs.x.dtype)
+            return implementation(flipped).flip(1).to(inputs.x.dtype)
 
     def _misfit(self, inputs: ScanInputs) -> str | None:
-        """Return a sentence on the first size that the kernels of "cuda" cannot take."""
+        """Describe the first size that the kernels of "cuda" cannot take; None if there is none."""
         sizes = dict(zip(self.axes["x"], inputs.x.shape, strict=True)) | {"N": inputs.B.shape[-1]}
         for axis, largest in self.largest.items():
             size = sizes[axis]
             if size < 16 or size > largest or size & (size - 1):
                 return (
-                    f"{self.name}'s backend 'cuda' got a {SIDES[axis]} of {size}: expected a power "
-                    f"of two from 16 to {largest}"
+                    f"{self.name}'s backend 'cuda' got a {AXIS_NAMES[axis]} of {size}: expected a "
+                    f"power of two from 16 to {largest}"
                 )
         return None
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.kernels.dispatch import check_device, check_float, fast_backend, pick_backend
+from asysplat.kernels.dispatch import check_device, check_float, choose_fastest, look_up_backend
 from asysplat.kernels.precision import without_autocast
 from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
@@ -135,8 +135,8 @@ def render(
         if sh_degree is not None:
             scenes = replace(scenes, sh=scenes.sh[..., : (sh_degree + 1) ** 2, :])
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
-        auto = BACKENDS[fast_backend(scenes.means, "reference")]
-        draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
+        auto = BACKENDS[choose_fastest(scenes.means, "reference")]
+        draw = look_up_backend("render", {"auto": auto, **BACKENDS}, backend)
         view_masks = None if masks is None else _one_batch(masks, batch)
         projected = centers = None
         if projections:

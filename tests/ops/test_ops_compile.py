@@ -28,7 +28,7 @@ KERNELS = {
 def test_all_kernels_of_scans_compile(monkeypatch, name, architecture, dtype):
     scan = import_module("asysplat.ops.selective_scan.cuda.scan")
     kernels = collect_kernels(monkeypatch, architecture, ["GRADIENT", "OF_B"])
-    monkeypatch.setattr("asysplat.kernels.dispatch._interpreted", lambda backend: True)
+    monkeypatch.setattr("asysplat.kernels.dispatch._uses_interpreter", lambda backend: True)
     # Few unrolled tokens: the compiler takes seconds for each.
     monkeypatch.setattr(scan, "FORWARD_CHUNK", 2)
     monkeypatch.setattr(scan, "BACKWARD_CHUNK", 2)

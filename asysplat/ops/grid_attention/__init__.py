@@ -1,10 +1,10 @@
-"""Attention between tokens of all views at the same place of a p_g x p_g grid (Sec. 3.3)."""
+"""Attention among the tokens of all views at the same place in a p_g x p_g grid (Sec. 3.3)."""
 
 from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.kernels.dispatch import check_device, check_float, check_shape, pick_backend
+from asysplat.kernels.dispatch import check_device, check_float, check_shape, look_up_backend
 from asysplat.ops.grid_attention.reference import grid_attention_reference
 from asysplat.ops.grid_attention.sdpa import grid_attention_sdpa
 
@@ -22,19 +22,22 @@ def grid_attention(
     grid: int,
     backend: str = "auto",
 ) -> Float[Tensor, "B V h w H P"]:
-    """Attend from token (i, j) of every view to tokens (i + a p_g, j + b p_g) of all views.
+    """Attend from token (i, j) of each view to the tokens (i + a p_g, j + b p_g) of all views.
+
+    Here a and b are any integers for which the token exists.
 
     Args:
-        q, k, v: token maps of V views and H heads, P the head_dim.
-        grid: p_g; 1 is full attention.
+        q, k, v: queries, keys and values of the h x w tokens of V views; P is the head_dim.
+        grid: p_g, the side of the grid in tokens; 1 is full attention.
+        backend: "sdpa" (torch's fused attention), "reference", or "auto", which is "sdpa".
 
     Raises:
         InputError: shapes, devices or types that do not fit together, grid < 1, or an unknown
             backend.
     """
-    form = pick_backend("grid_attention", _BACKENDS, backend)
+    implementation = look_up_backend("grid_attention", _BACKENDS, backend)
     _check(q, k, v, grid)
-    return form(q, k, v, grid)
+    return implementation(q, k, v, grid)
 
 
 def _check(q: Tensor, k: Tensor, v: Tensor, grid: int) -> None:

@@ -7,10 +7,10 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import (
     check_device,
-    check_fast_backend,
     check_float,
+    check_kernel_backend,
     check_shape,
-    pick_backend,
+    look_up_backend,
 )
 from asysplat.kernels.precision import without_autocast
 from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
@@ -26,20 +26,21 @@ def image_loss(
     """Compute (1 - w) mean|rendered - target| + w (1 - mean SSIM) of each image.
 
     SSIM (Wang et al. 2004) is that of `asysplat.evaluation.metrics.ssim`, but `rendered` is not
-    clamped: windows of 11x11, Gaussian of sigma 1.5, biased covariance, wholly inside the image.
-    An image without such a window, less than 11 pixels high or wide, has the loss of w = 0.
+    clamped. Its 11x11 windows lie wholly inside the image, are weighted by a Gaussian of sigma 1.5,
+    and have biased covariances. An image less than 11 pixels high or wide, which has no such
+    window, has the loss of w = 0.
 
     Args:
         rendered: RGB; half precision is computed in fp32.
-        target: RGB in [0, 1]; a constant, no gradient is computed for it.
-        ssim_weight: w in [0, 1]; 0 costs nothing.
-        masks: False where a pixel is ignored: it takes the target's values, with no error and no
-            gradient.
+        target: RGB in [0, 1], a constant for which no gradient is computed.
+        ssim_weight: w in [0, 1]; at 0, SSIM is not computed.
+        masks: False where a pixel is ignored: it takes the target's values, and so has no error and
+            no gradient.
         backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" for float32
             tensors on a CPU, else "reference".
 
     Returns:
-        In fp32, or float64 for float64.
+        The loss of each image in fp32, or in float64 if `rendered` is float64.
 
     Raises:
         InputError: shapes, types or devices that do not fit together, a weight outside [0, 1], an
@@ -48,7 +49,7 @@ def image_loss(
     _check(rendered, target, ssim_weight, masks)
     on_cpu = rendered.device.type == "cpu" and rendered.dtype != torch.float64
     backends = {"auto": "cpu" if on_cpu else "reference", "reference": "reference", "cpu": "cpu"}
-    backend = pick_backend("image_loss", backends, backend)
+    backend = look_up_backend("image_loss", backends, backend)
     dtype = torch.promote_types(rendered.dtype, torch.float32)
     rendered, target = rendered.to(dtype), target.detach().to(dtype)
     if masks is not None:
@@ -56,7 +57,7 @@ def image_loss(
     if min(rendered.shape[-2:]) < SIZE:
         ssim_weight = 0.0
     if backend == "cpu":
-        check_fast_backend("image_loss", backend, rendered)
+        check_kernel_backend("image_loss", backend, rendered)
         from asysplat.ops.image_loss.cpu import image_loss_cpu
 
         return image_loss_cpu(rendered, target, ssim_weight)

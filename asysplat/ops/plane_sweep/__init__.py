@@ -1,9 +1,9 @@
-"""The kernels of the plane sweep: `cost_volume`, `sgm` and `consistency` of a backend's module.
+"""The operators of the plane sweep; each backend is a module with all three.
 
-cost_volume compares each pixel with its neighbors' at every plane (Collins 1996), sgm aggregates
-the costs along the image's rows and columns (semi-global matching, Hirschmueller 2008), and
-consistency counts how many other views confirm each depth. `asysplat.models.prior.plane_sweep`
-makes depths from them.
+`cost_volume` compares the patch around each pixel with neighboring views at every plane (Collins
+1996), `sgm` aggregates the costs along the image's rows and columns (semi-global matching,
+Hirschmueller 2008), and `consistency` counts the other views that confirm or contradict each depth.
+`asysplat.models.prior.plane_sweep` computes depths from their results.
 """
 
 from types import ModuleType
@@ -12,11 +12,11 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.kernels.dispatch import (
-    FAST,
-    check_fast_backend,
-    fast_backend,
+    KERNEL_BACKENDS,
+    check_kernel_backend,
+    choose_fastest,
     load_kernels,
-    pick_backend,
+    look_up_backend,
 )
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.reference import BestPlane, Consistency
@@ -25,20 +25,20 @@ __all__ = ["BestPlane", "Consistency", "choose_backend", "load_backend"]
 
 
 def choose_backend(backend: str, x: Tensor) -> str:
-    """Return the backend's name; for "auto" that of x's device, "reference" for float64.
+    """Return the backend's name; for "auto", that of x's device, or "reference" for float64.
 
     Raises:
         InputError: an unknown name, or a backend that cannot take x.
     """
-    pick_backend("plane_sweep", dict.fromkeys(("auto", "reference", *FAST)), backend)
+    look_up_backend("plane_sweep", dict.fromkeys(("auto", "reference", *KERNEL_BACKENDS)), backend)
     if backend == "auto":
-        return fast_backend(x, "reference")
+        return choose_fastest(x, "reference")
     if backend != "reference":
-        check_fast_backend("plane_sweep", backend, x)
+        check_kernel_backend("plane_sweep", backend, x)
     return backend
 
 
 def load_backend(backend: str, x: Tensor) -> ModuleType:
-    """Return the module that computes with x; for a tensor without content, the reference."""
+    """Return the backend's module; the reference if x has no content (meta or fake tensors)."""
     name = "reference" if x.is_meta or is_fake(x) else choose_backend(backend, x)
     return reference if name == "reference" else load_kernels("plane_sweep", name)

@@ -9,7 +9,7 @@ from asysplat.ops.selective_scan.reference import selective_scan_reference
 
 
 def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:
-    """Count a multiplication and an addition to update each state, and to read it.
+    """Count a multiplication and an addition to update each state, and as many to read it.
 
     The backward pass computes the states again, and four gradients.
     """
@@ -20,7 +20,7 @@ def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int
 _SCAN = Scan(
     "selective_scan",
     axes={"x": "B L D", "dt": "B L D", "A": "D N", "B": "B L N", "C": "B L N", "D": "D"},
-    forms={"chunked": selective_scan_chunked, "reference": selective_scan_reference},
+    torch_backends={"chunked": selective_scan_chunked, "reference": selective_scan_reference},
     count_flops=count_flops,
     largest={"N": 256},
 )
@@ -39,13 +39,13 @@ def selective_scan(
     """Scan h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t, y_t = C_t . h_t + D x_t, per channel.
 
     Args:
-        x: inputs; half precision is computed in fp32, returned in the same type.
+        x: inputs; for half precision, y is computed in fp32 and returned in the type of x.
         dt: step sizes > 0, after the softplus.
-        A: < 0, so that no exponent is positive.
+        A: decay rates < 0, so that no exponent is positive.
         B, C: input and output projections, shared by the channels.
         D: skip weight of each channel.
         backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
-            "auto": the kernels of the device, and "chunked" for float64 and for sizes that "cuda"
+            "auto": the kernels of the device, but "chunked" for float64 and for sizes that "cuda"
             cannot take.
         reverse: scan from the last token to the first.
 

@@ -16,9 +16,18 @@ def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int
     within = 2 * tokens * CHUNK * heads * head_dim
     states = 4 * tokens * heads * head_dim * state_size
     forward = scores + within + states
-    # Scores and states again, two gradients for every product, and the states' outputs for the
-    # gradients of the decays.
+    # The backward pass computes the scores, the states and the outputs of the states again (for the
+    # gradients of the decays), and two gradients for every product.
     return forward, 3 * scores + 2 * within + 3 * states
+
+
+_SCAN = Scan(
+    "ssd",
+    axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
+    torch_backends={"chunked": ssd_chunked, "reference": ssd_reference},
+    count_flops=count_flops,
+    largest={"P": 128, "N": 256},
+)
 
 
 def ssd(
@@ -34,20 +43,10 @@ def ssd(
     """Scan h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t^T, y_t = C_t h_t + D x_t, per head.
 
     Args:
-        x: inputs of H heads, P the head_dim; half precision is computed in fp32, returned in the
-            same type.
+        x: inputs of H heads; P is the head_dim. For half precision, see `selective_scan`.
         dt, A, B, C, D, backend, reverse: see `selective_scan`, with heads in place of channels.
 
     Raises:
         InputError: see `selective_scan`.
     """
     return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)
-
-
-_SCAN = Scan(
-    "ssd",
-    axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
-    forms={"chunked": ssd_chunked, "reference": ssd_reference},
-    count_flops=count_flops,
-    largest={"P": 128, "N": 256},
-)
