@@ -1,4 +1,4 @@
-"""Gathers from sixteen places of an image at once, two neighbors in one read."""
+"""Gathers at sixteen points of an image at once; each read returns two adjacent numbers."""
 
 import numba
 from llvmlite import ir
@@ -10,10 +10,10 @@ from asysplat.kernels.simd.vectors import (
     INTEGERS,
     LANES,
     VECTOR,
+    broadcast,
     call_llvm,
     check_range,
     lanes,
-    splat,
 )
 
 HALF = LANES // 2
@@ -22,15 +22,15 @@ PAIR = ir.IntType(64)
 
 @intrinsic
 def gather_pairs(typing_context, image, y, x):
-    """Return both numbers at LANES places of a contiguous array [H, W, 2].
+    """Return both numbers at LANES points of a contiguous array [H, W, 2].
 
     Args:
-        y, x: vectors of the places, >= 0, rounded down.
+        y, x: vectors of coordinates >= 0, which are rounded down.
     """
 
     def generate(context, builder, signature, args):
         image = _Image(context, builder, signature, args)
-        pairs = image.pairs(image.index(*image.whole(args[1:])), PAIR)
+        pairs = image.pairs(image.index(*image.round_down(args[1:])), PAIR)
         return context.make_tuple(builder, signature.return_type, pairs)
 
     return types.UniTuple(VECTOR, 2)(image, y, x), generate
@@ -38,27 +38,27 @@ def gather_pairs(typing_context, image, y, x):
 
 @intrinsic
 def gather_squares(typing_context, image, y, x):
-    """Return the four numbers around LANES places of a contiguous array [H, W].
+    """Return the four numbers around LANES points of a contiguous array [H, W].
 
     Args:
-        y, x: vectors of the places, from 0 to less than H - 1 and W - 1.
+        y, x: vectors of coordinates, from 0 to less than H - 1 and W - 1.
 
     Returns:
-        The numbers above left and right, and below left and right; the place relative to the first,
-        down and right, in [0, 1).
+        Six vectors: the numbers above left, above right, below left and below right; and the
+        fractions of y and x, in [0, 1).
     """
 
     def generate(context, builder, signature, args):
         image = _Image(context, builder, signature, args)
-        whole = image.whole(args[1:])
+        whole = image.round_down(args[1:])
         above = image.index(*whole)
         below = builder.add(above, image.width)
         numbers = [pair for row in (above, below) for pair in image.pairs(row, ir.FloatType())]
-        parts = [
-            builder.fsub(place, builder.sitofp(number, FLOATS))
-            for place, number in zip(args[1:], whole, strict=True)
+        fractions = [
+            builder.fsub(coordinate, builder.sitofp(number, FLOATS))
+            for coordinate, number in zip(args[1:], whole, strict=True)
         ]
-        return context.make_tuple(builder, signature.return_type, numbers + parts)
+        return context.make_tuple(builder, signature.return_type, numbers + fractions)
 
     return types.UniTuple(VECTOR, 6)(image, y, x), generate
 
@@ -70,20 +70,22 @@ class _Image:
         self.context, self.builder = context, builder
         self.array = context.make_array(signature.args[0])(context, builder, args[0])
         width = builder.extract_value(self.array.shape, 1)
-        self.width = splat(builder, builder.trunc(width, ir.IntType(32)))
+        self.width = broadcast(builder, builder.trunc(width, ir.IntType(32)))
 
-    def whole(self, places):
-        """Return the whole numbers of places, rounded down."""
-        return [self.builder.fptosi(place, INTEGERS) for place in places]
+    def round_down(self, coordinates):
+        """Round coordinates >= 0 down to integers."""
+        return [self.builder.fptosi(coordinate, INTEGERS) for coordinate in coordinates]
 
     def index(self, row: ir.Value, column: ir.Value) -> ir.Value:
         return self.builder.add(self.builder.mul(row, self.width), column)
 
     def pairs(self, index: ir.Value, kind: ir.Type) -> list[ir.Value]:
-        """Return the numbers at indices and those after them; a pair is read as one of 64 bits.
+        """Return the numbers at LANES indices, and the numbers after them.
+
+        Both are read as one number of 64 bits.
 
         Args:
-            index: in units of `kind`, numbers or pairs.
+            index: vector of indices, which count numbers or, if `kind` is PAIR, pairs.
         """
         builder = self.builder
         self._check(index, kind)

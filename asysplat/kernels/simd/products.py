@@ -1,7 +1,7 @@
-"""Products of small matrices inside kernels, whose factors are in the cache.
+"""Products of small matrices that are in the cache, for use inside kernels.
 
 A tile of ROWS x LANES sums stays in registers, and every sum is taken in the order of its terms,
-rounded once a term: the tiling changes no bit.
+rounded once per term: the tiling changes no bit.
 """
 
 import llvmlite.binding
@@ -12,10 +12,19 @@ from numba.core.base import BaseContext
 from numba.extending import intrinsic
 
 from asysplat.kernels.simd.threads import inline
-from asysplat.kernels.simd.vectors import FLOATS, INTEGERS, LANES, ONE, check_range, emit_fma, splat
+from asysplat.kernels.simd.vectors import (
+    FLOATS,
+    INTEGERS,
+    LANES,
+    ONE,
+    ZEROS,
+    broadcast,
+    check_range,
+    emit_fma,
+)
 
-HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
-ROWS = 8 if HAS_32_VECTORS else 4
+HAS_AVX512 = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
+ROWS = 8 if HAS_AVX512 else 4  # rows of a tile: its sums take 8 registers of AVX-512 or of AVX2
 BYTES = 4  # size of a float32
 
 
@@ -24,9 +33,10 @@ def add_product(out, a, b, keep):
     """Compute out = keep out + a b; with `keep` = 0, NaN in `out` is overwritten too.
 
     Args:
-        out: [rows, columns], columns in whole vectors of LANES, one after the other.
-        a: [rows, terms], in any order.
-        b: [terms, columns], as `out`.
+        out: [rows, columns], contiguous along rows; the columns are a multiple of LANES.
+        a: [rows, terms], of any strides.
+        b: [terms, columns], contiguous along rows.
+        keep: factor of the previous values of `out`.
     """
     rows, terms = a.shape
     whole = rows // ROWS * ROWS
@@ -41,7 +51,7 @@ def add_product(out, a, b, keep):
 def add_triangle(out, a, b, upper):
     """Compute out += a b, where square `a` has zeros below its diagonal (`upper`) or above it.
 
-    Its side is a multiple of ROWS; of its zeros, only those in the diagonal tiles are read.
+    The side of `a` is a multiple of ROWS. Its zeros are read only in the tiles on the diagonal.
     """
     side = len(a)
     for column in range(0, out.shape[1], LANES):
@@ -53,7 +63,12 @@ def add_triangle(out, a, b, upper):
 
 @inline
 def transpose(matrix, out):
-    """Write the transpose into the first columns of `out`; columns of `matrix` as in a product."""
+    """Write the transpose of `matrix` into the first columns of `out`.
+
+    Args:
+        matrix: [rows, columns], contiguous along rows; the columns are a multiple of LANES.
+        out: [columns, rows or more], contiguous along rows.
+    """
     rows, columns = matrix.shape
     whole = rows // LANES * LANES
     for column in range(0, columns, LANES):
@@ -66,7 +81,7 @@ def transpose(matrix, out):
 
 @intrinsic
 def transpose_tile(typing_context, matrix, out, row, column):
-    """Write the transpose of LANES x LANES numbers, from `row` and `column` of `matrix` on."""
+    """Write the transpose of the LANES x LANES numbers of `matrix` from `row`, `column` on."""
 
     def generate(context, builder, signature, args):
         source, target = (_Matrix(context, builder, signature.args[i], args[i]) for i in range(2))
@@ -79,11 +94,11 @@ def transpose_tile(typing_context, matrix, out, row, column):
             builder.load(source.vector(builder.add(row, row.type(i)), column), align=BYTES)
             for i in range(LANES)
         ]
-        # Interleaving the rows of both halves four times swaps the indices.
+        # Interleaving the first half of the rows with the second, log2(LANES) times, transposes.
         half = LANES // 2
         for _ in range(LANES.bit_length() - 1):
             vectors = [
-                _interleaved(builder, vectors[i], vectors[i + half], first)
+                _interleave(builder, vectors[i], vectors[i + half], first)
                 for i in range(half)
                 for first in (0, half)
             ]
@@ -95,25 +110,25 @@ def transpose_tile(typing_context, matrix, out, row, column):
     return types.void(matrix, out, row, column), generate
 
 
-def _interleaved(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, first: int) -> ir.Value:
-    """Interleave LANES / 2 numbers of both vectors, from the number `first` on."""
+def _interleave(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, first: int) -> ir.Value:
+    """Interleave the LANES / 2 numbers of each vector from the number `first` on."""
     order = [i for k in range(first, first + LANES // 2) for i in (k, LANES + k)]
     return builder.shuffle_vector(a, b, ir.Constant(INTEGERS, order))
 
 
-def _tile(rows: int):
-    """Return the intrinsic that computes keep out + a b for rows x LANES numbers of `out`.
+def _make_tile_product(rows: int):
+    """Return the intrinsic that computes out = keep out + a b for rows x LANES numbers of `out`.
 
-    They begin at `row` and `column`; the sum is over the terms `first` to `last`.
+    The numbers begin at `row` and `column`; the product sums the terms from `first` to `last`.
     """
 
     @intrinsic
     def add(typing_context, out, a, b, row, column, first, last, keep):
         def generate(context, builder, signature, args):
             matrices = [_Matrix(context, builder, signature.args[i], args[i]) for i in range(3)]
-            place = zip(args[3:7], signature.args[3:7], strict=True)
-            place = (context.cast(builder, value, kind, types.intp) for value, kind in place)
-            _generate_tile(builder, rows, matrices, *place, args[7])
+            indices = zip(args[3:7], signature.args[3:7], strict=True)
+            indices = (context.cast(builder, value, kind, types.intp) for value, kind in indices)
+            _generate_tile_product(builder, rows, matrices, *indices, args[7])
             return context.get_dummy_value()
 
         return types.void(out, a, b, row, column, first, last, keep), generate
@@ -121,7 +136,7 @@ def _tile(rows: int):
     return add
 
 
-def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
+def _generate_tile_product(builder, rows, matrices, row, column, first, last, keep):
     out, a, b = matrices
     terms = builder.sub(last, first)
     out.check(row, rows, column, LANES)
@@ -133,12 +148,12 @@ def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
     sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(rows)]
     overwrite = builder.fcmp_ordered("==", keep, keep.type(0.0))
     for place, value in zip(places, sums, strict=True):
-        scaled = builder.fmul(builder.load(place, align=BYTES), splat(builder, keep))
-        builder.store(builder.select(overwrite, ir.Constant(FLOATS, [0.0] * LANES), scaled), value)
+        scaled = builder.fmul(builder.load(place, align=BYTES), broadcast(builder, keep))
+        builder.store(builder.select(overwrite, ZEROS, scaled), value)
     with cgutils.for_range_slice(builder, first, last, first.type(1)) as (term, _):
         vector = builder.load(b.vector(term, column), align=BYTES)
         for number, value in zip(numbers, sums, strict=True):
-            factor = splat(builder, builder.load(a.element(number, term), align=BYTES))
+            factor = broadcast(builder, builder.load(a.element(number, term), align=BYTES))
             builder.store(emit_fma(builder, factor, vector, builder.load(value)), value)
     for place, value in zip(places, sums, strict=True):
         builder.store(builder.load(value), place, align=BYTES)
@@ -155,7 +170,7 @@ class _Matrix:
         self.strides = [builder.extract_value(array.strides, axis) for axis in range(2)]
 
     def check(self, row, rows, column, columns) -> None:
-        """Check both ranges by `check_range`; counts are int or generated values."""
+        """Check the ranges of rows and columns by `check_range`; counts may be generated values."""
         for first, count, length in zip((row, column), (rows, columns), self.shape, strict=True):
             count = first.type(count) if isinstance(count, int) else count
             check_range(self.context, self.builder, first, count, length)
@@ -167,8 +182,8 @@ class _Matrix:
         return self.builder.bitcast(byte, ir.FloatType().as_pointer())
 
     def vector(self, row: ir.Value, column: ir.Value) -> ir.Value:
-        """Return a pointer to LANES elements from this one on."""
+        """Return a pointer to the LANES elements from this one on."""
         return self.builder.bitcast(self.element(row, column), FLOATS.as_pointer())
 
 
-add_tile, add_row = _tile(ROWS), _tile(1)
+add_tile, add_row = _make_tile_product(ROWS), _make_tile_product(1)

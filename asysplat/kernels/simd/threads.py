@@ -1,4 +1,4 @@
-"""CPU kernels: cached on disk, without Python's global lock, on as many threads as torch uses."""
+"""Compilation of CPU kernels, cached on disk, and their runs on as many threads as torch uses."""
 
 import hashlib
 import inspect
@@ -17,13 +17,16 @@ from numba import njit
 from numba.core.caching import UserProvidedCacheLocator
 
 PACKAGE = Path(__file__).parents[2]
-FOLDERS = ("kernels", "ops", "rendering")  # the sources of kernels
+FOLDERS = ("kernels", "ops", "rendering")  # folders with the sources of kernels
 Result = TypeVar("Result")
-PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
+PER_THREAD = 4  # portions of the work per thread, so that a faster thread can take more of them
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile a kernel for `run_blocks`; with NUMBA_BOUNDSCHECK=1 it checks every index."""
+    """Compile a kernel for `run_blocks`, which does not hold Python's global lock.
+
+    With NUMBA_BOUNDSCHECK=1 it checks every index.
+    """
     config = numba.config
     before = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
     config.CACHE_DIR = _cache_folder(config.CACHE_DIR)
@@ -44,20 +47,20 @@ class CacheBySources(UserProvidedCacheLocator):
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
-        """Return a kernel's folder; outside of the package it is Numba's, by the file's path."""
+        """Return a kernel's folder in the cache: Numba's choice for files outside the package."""
         if not Path(py_file).is_relative_to(PACKAGE):
             return super().get_suitable_cache_subpath(py_file)
         return "-".join(Path(py_file).relative_to(PACKAGE).parent.parts)
 
     def get_source_stamp(self) -> str:
-        """Return what changes with a kernel's file."""
+        """Return the hash of the kernel's file."""
         return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
 
 
 @cache
 def _cache_folder(parent: str) -> str:
-    """Return the folder for this version of the sources; bounds-checked kernels have their own."""
-    # Numba compares only a kernel's own file, not its parts in other files.
+    """Return the cache folder for this version of all sources, with or without bounds checks."""
+    # Numba compares only the kernel's own file, not the files of the functions that it inlines.
     paths = [path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
@@ -76,10 +79,10 @@ def _home_cache() -> Path | None:
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
-    """Run `kernel(start, stop, *args)` for neighboring numbers of `bounds`, in any order.
+    """Run `kernel(start, stop, *args)` for each two consecutive bounds, on all threads.
 
-    The results are returned in the order of `bounds`. A kernel's output must depend on its range
-    alone, so that the number of threads changes no bit.
+    The results are returned in the order of the bounds. What a kernel computes for a block must not
+    depend on the bounds, so that the number of threads changes no bit.
     """
     threads = torch.get_num_threads()
     ranges = [
@@ -93,12 +96,16 @@ def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object)
 
 
 def even_bounds(count: int) -> np.ndarray:
-    """Divide `count` blocks of equal cost into portions."""
+    """Divide `count` blocks of equal cost into portions; return the bounds."""
     return np.linspace(0, count, min(count, _portions()) + 1).astype(np.int64)
 
 
 def weighted_bounds(ends: np.ndarray) -> np.ndarray:
-    """Divide blocks with cumulative costs `ends`, [0, ..., total], into portions."""
+    """Divide blocks into portions of about equal cost; return the bounds.
+
+    Args:
+        ends: cumulative costs of the blocks, [0, ..., total].
+    """
     targets = np.linspace(ends[0], ends[-1], _portions() + 1)
     bounds = np.searchsorted(ends, targets)
     bounds[0], bounds[-1] = 0, len(ends) - 1

@@ -1,6 +1,6 @@
-"""Sixteen float32 as one Numba value, which a loop keeps in a register.
+"""Vectors of sixteen float32, each one Numba value, which a loop keeps in a register.
 
-A float32 becomes sixteen equal ones wherever a vector is expected.
+Wherever a vector is expected, a float32 is converted to sixteen equal numbers.
 """
 
 import operator
@@ -18,15 +18,17 @@ from numba.extending import intrinsic, lower_cast, overload, register_model
 
 from asysplat.kernels.simd.threads import inline
 
-LANES = 16  # one vector of AVX-512; two or four of older ones
+LANES = 16  # numbers of a vector: one register of AVX-512, two of AVX2, four of SSE
 HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
 FLOATS, INTEGERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
 
+ZEROS = ir.Constant(FLOATS, [0.0] * LANES)
+
 ZERO, ONE = np.float32(0), np.float32(1)
-# Adding and subtracting it rounds a float32 to an integer, which is in the lowest bits of the sum.
+# Adding and subtracting ROUND rounds a float32 to an integer, which is in the sum's lowest bits.
 ROUND = np.float32(1.5 * 2**23)
-UNDERFLOW = np.float32(-127)  # all bits of its `exp2` are 0
-# 2^f on [-1/2, 1/2]: the Chebyshev interpolation, relative error 2e-9.
+UNDERFLOW = np.float32(-127)  # number whose `exp2` is exactly 0
+# Coefficients of 2^f on [-1/2, 1/2]: Chebyshev interpolation, relative error 2e-9.
 P0, P1, P2 = map(np.float32, (1.00000000059202, 0.6931472056005139, 0.24022646608715542))
 P3, P4 = map(np.float32, (0.05550328997510684, 0.009618519534332742))
 P5, P6 = map(np.float32, (0.00133998603653958, 0.00015337576817951937))
@@ -41,7 +43,7 @@ class Vector(types.Type):
 
 
 VECTOR = Vector()
-MASK = types.uint16  # a bit for each of a vector's numbers
+MASK = types.uint16  # a bit for each number of a vector
 
 
 @register_model(Vector)
@@ -50,7 +52,7 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, kind, FLOATS)
 
 
-def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+def broadcast(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """Return a vector of equal numbers."""
     undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
     one = builder.insert_element(undefined, value, ir.IntType(32)(0))
@@ -58,8 +60,8 @@ def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
 
 
 @lower_cast(types.Float, Vector)
-def _splat(context, builder, from_type, to_type, value):
-    return splat(builder, value)
+def _cast(context, builder, from_type, to_type, value):
+    return broadcast(builder, value)
 
 
 def call_llvm(builder: ir.IRBuilder, result: ir.Type, name: str, *args: ir.Value, **options):
@@ -79,9 +81,9 @@ def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir
 
 
 def check_range(context, builder, first, count, length) -> None:
-    """With NUMBA_BOUNDSCHECK=1, raise IndexError in the kernel for a range outside an array.
+    """With NUMBA_BOUNDSCHECK=1, make the kernel raise IndexError for a range outside an array.
 
-    That is, unless `count` elements from `first` on are among `length`.
+    The range is the `count` elements from `first` on; the array has `length` elements.
     """
     if not numba.config.BOUNDSCHECK:
         return
@@ -125,13 +127,12 @@ def store(typing_context, rows, row, value):
 
 @intrinsic
 def load_some(typing_context, numbers, first, count):
-    """Load `count` numbers of a contiguous array from `first` on, and zeros up to LANES."""
+    """Load `count` numbers of a contiguous array from `first` on; the others up to LANES are 0."""
 
     def generate(context, builder, signature, args):
-        pointer, mask = _some(context, builder, signature, args)
-        nothing = ir.Constant(FLOATS, [0.0] * LANES)
+        pointer, mask = _pointer_and_mask(context, builder, signature, args)
         name = f"llvm.masked.load.v{LANES}f32.p0"
-        return call_llvm(builder, FLOATS, name, pointer, ir.IntType(32)(4), mask, nothing)
+        return call_llvm(builder, FLOATS, name, pointer, ir.IntType(32)(4), mask, ZEROS)
 
     return VECTOR(numbers, first, count), generate
 
@@ -141,7 +142,7 @@ def store_some(typing_context, numbers, first, count, value):
     """Write the first `count` of a vector's numbers to a contiguous array, from `first` on."""
 
     def generate(context, builder, signature, args):
-        pointer, mask = _some(context, builder, signature, args)
+        pointer, mask = _pointer_and_mask(context, builder, signature, args)
         name = f"llvm.masked.store.v{LANES}f32.p0"
         call_llvm(builder, ir.VoidType(), name, args[3], pointer, ir.IntType(32)(4), mask)
         return context.get_dummy_value()
@@ -154,13 +155,13 @@ def zeros(typing_context):
     """Return a vector of zeros."""
 
     def generate(context, builder, signature, args):
-        return ir.Constant(FLOATS, [0.0] * LANES)
+        return ZEROS
 
     return VECTOR(), generate
 
 
 def _unary(result: types.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]):
-    """Return an intrinsic of one vector."""
+    """Return an intrinsic that computes `emit` of a vector."""
 
     @intrinsic
     def compute(typing_context, value):
@@ -172,7 +173,7 @@ def _unary(result: types.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value
     return compute
 
 
-def sum_of(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+def emit_sum(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
     """Return the sum of a vector's numbers."""
     start, name = ir.FloatType()(-0.0), f"llvm.vector.reduce.fadd.v{LANES}f32"
     # "reassoc" lets the compiler add in the order that is fastest on the processor.
@@ -201,16 +202,16 @@ def _emit_least(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     return builder.extract_element(value, ir.IntType(32)(0))
 
 
-total = _unary(types.float32, sum_of)  # the sum of a vector's numbers
-least = _unary(types.float32, _emit_least)  # the least of a vector's numbers
-sqrt = _unary(VECTOR, _emit_sqrt)  # the square root of every number
-rsqrt = _unary(VECTOR, _emit_rsqrt)  # 1 / sqrt(x) of every number, to a relative error of 3e-7
+total = _unary(types.float32, emit_sum)  # sum of a vector's numbers
+least = _unary(types.float32, _emit_least)  # least of a vector's numbers
+sqrt = _unary(VECTOR, _emit_sqrt)  # square root of each number
+rsqrt = _unary(VECTOR, _emit_rsqrt)  # 1 / sqrt(x) of each number, to a relative error of 3e-7
 
 
 def vector_at(context, builder, signature, args, step=LANES):
     """Return a pointer to LANES elements of the contiguous array args[0].
 
-    They begin at the element args[1] x `step`.
+    The first is the element args[1] x `step`.
     """
     array = context.make_array(signature.args[0])(context, builder, args[0])
     index = context.cast(builder, args[1], signature.args[1], types.intp)
@@ -219,19 +220,19 @@ def vector_at(context, builder, signature, args, step=LANES):
     return builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
 
 
-def _some(context, builder, signature, args):
+def _pointer_and_mask(context, builder, signature, args):
     """Return a pointer to element args[1] of args[0], and a mask of the first args[2] lanes."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
     first = context.cast(builder, args[1], signature.args[1], types.intp)
     count = context.cast(builder, args[2], signature.args[2], types.intp)
     check_range(context, builder, first, count, array.nitems)
     pointer = builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
-    few = builder.trunc(count, ir.IntType(32))
-    return pointer, builder.icmp_signed("<", lanes(0, LANES), splat(builder, few))
+    count = builder.trunc(count, ir.IntType(32))
+    return pointer, builder.icmp_signed("<", lanes(0, LANES), broadcast(builder, count))
 
 
 def _binary(result: types.Type, emit: Callable[..., ir.Value]):
-    """Return an intrinsic of two vectors."""
+    """Return an intrinsic that computes `emit` of two vectors."""
 
     @intrinsic
     def compute(typing_context, a, b):
@@ -244,7 +245,7 @@ def _binary(result: types.Type, emit: Callable[..., ir.Value]):
 
 
 def _overload(symbol: Callable, emit: Callable[..., ir.Value]) -> None:
-    """Overload an operator or function of two numbers for vectors."""
+    """Overload an operator or function of two numbers for vectors, computed by `emit`."""
     compute = _binary(VECTOR, emit)
 
     @overload(symbol)
@@ -257,7 +258,7 @@ _overload(operator.add, lambda builder, a, b: builder.fadd(a, b))
 _overload(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _overload(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _overload(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-# Both give the second number where the first is NaN.
+# Both return the second number where either is NaN.
 _overload(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 _overload(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
@@ -266,12 +267,12 @@ def _emit_less(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
     return builder.bitcast(builder.fcmp_ordered("<", a, b), ir.IntType(LANES))
 
 
-less = _binary(MASK, _emit_less)  # a bit for each number, the lowest for the first: 1 if a < b
+less = _binary(MASK, _emit_less)  # mask of the numbers with a < b; the first's bit is the lowest
 
 
 @intrinsic
 def where(typing_context, mask, yes, no):
-    """Return the numbers of `yes` whose bit of `mask` is 1, and those of `no` elsewhere."""
+    """Return the numbers of `yes` where the bit of `mask` is 1, and those of `no` elsewhere."""
 
     def generate(context, builder, signature, args):
         bits = builder.bitcast(args[0], ir.VectorType(ir.IntType(1), LANES))
@@ -281,7 +282,7 @@ def where(typing_context, mask, yes, no):
 
 
 def lanes(start: int, stop: int, step: int = 1) -> ir.Constant:
-    """Return a vector of integers, such as the mask of a shuffle."""
+    """Return the vector of the integers from `start` to `stop`, such as the mask of a shuffle."""
     numbers = list(range(start, stop, step))
     return ir.Constant(ir.VectorType(ir.IntType(32), len(numbers)), numbers)
 
@@ -316,5 +317,8 @@ def exp2(x):
 
 @inline
 def decay2(x):
-    """Compute 2^x for x <= 0, to a relative error of 8e-8 or 1e-38; 0 below UNDERFLOW."""
+    """Compute 2^x for x <= 0, to a relative error of 8e-8 or an absolute one of 1e-38.
+
+    It is 0 from UNDERFLOW down.
+    """
     return exp2(max(x, UNDERFLOW))

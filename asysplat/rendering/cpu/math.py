@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 
 from asysplat.geometry import spherical_harmonics as sh
 from asysplat.kernels.simd.threads import inline
-from asysplat.kernels.simd.vectors import FLOATS, LANES, sum_of, vector_at
+from asysplat.kernels.simd.vectors import ZEROS, emit_sum, vector_at
 from asysplat.rendering import formulas
 
 SQRT_2, TWO_OVER_LN_2 = math.sqrt(2), 2 / math.log(2)
@@ -119,7 +119,7 @@ def sum_and_clear(typing_context, state, base):
     def generate(context, builder, signature, args):
         pointer = vector_at(context, builder, signature, args, step=1)
         vector = builder.load(pointer, align=4)
-        builder.store(ir.Constant(FLOATS, [0.0] * LANES), pointer, align=4)
-        return sum_of(builder, vector)
+        builder.store(ZEROS, pointer, align=4)
+        return emit_sum(builder, vector)
 
     return types.float32(state, base), generate
