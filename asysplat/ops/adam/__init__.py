@@ -1,4 +1,4 @@
-"""A step of Adam (Kingma and Ba 2015) for some rows of tensors."""
+"""A step of Adam (Kingma and Ba 2015) that updates some rows of tensors."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,14 @@ from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 
 @torch.no_grad()
 def adam_step(tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings) -> int:
-    """Update the visible rows in place: float32 on a CPU by a kernel, else by torch.
+    """Update the visible rows in place, by a kernel for float32 on a CPU, else by torch.
 
     A row that is not visible, or has a non-finite gradient in any of the tensors, keeps its
     parameters and averages in all of them.
+
+    Args:
+        tensors: tensors of N rows; row i of all of them is updated, or of none.
+        visible: rows to update.
 
     Returns:
         The number of visible rows with a non-finite gradient.

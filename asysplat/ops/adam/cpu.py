@@ -1,8 +1,7 @@
-"""Adam for CPUs (Numba): a task takes blocks of rows, a vector sixteen neighboring numbers.
+"""Adam for CPUs (Numba): a task updates blocks of rows, sixteen neighboring numbers at a time.
 
-Sixteen rows of K numbers are K vectors; a row of sixteen numbers or more is updated alone. The
-gradients of a block are checked in all tensors before the update, which then finds them in the
-cache.
+Rows of K < 16 numbers are updated sixteen at a time, as K vectors; longer rows one at a time. A
+block's gradients are checked in all tensors before its update, which then finds them in the cache.
 """
 
 import math
@@ -31,12 +30,19 @@ from asysplat.kernels.simd.vectors import (
 )
 from asysplat.ops.adam.reference import AdamSettings, Rows
 
-BLOCK = 1024  # rows
-ROUNDING = 2.0**-25  # adding less does not change 1 in float32
+BLOCK = 1024  # rows of a block
+ROUNDING = 2.0**-25  # number so small that 1 - ROUNDING is rounded to 1 in float32
 
 
 class FlatRows(NamedTuple):
-    """`Rows`, each as [N * K], with the rates and row numbers of LANES rows, [K, LANES]."""
+    """`Rows` as NumPy arrays.
+
+    Args:
+        parameter, gradient, mean, square: [N * K], see `Rows`.
+        steps: [N].
+        rates: [K, LANES] learning rates of the numbers of LANES rows.
+        rows: [K, LANES] row of each of these numbers, from 0 to LANES - 1.
+    """
 
     parameter: np.ndarray
     gradient: np.ndarray
@@ -48,7 +54,13 @@ class FlatRows(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """AdamSettings, 1 - beta as `new`, and the factors [steps, 2] of a step's mean and root."""
+    """The numbers of an update that all rows share.
+
+    Args:
+        beta2, eps: see `AdamSettings`.
+        new1, new2: 1 - beta1 and 1 - beta2, the weights of the new gradient and its square.
+        corrections: [steps, 2], factors of the mean and of the root after each number of steps.
+    """
 
     beta2: np.float32
     new1: np.float32
@@ -66,7 +78,7 @@ def adam_step_cpu(
             *(tensor.view(-1).numpy() for tensor in rows[:4]),
             rows.steps.numpy(),
             rows.rates.repeat(LANES).view(-1, LANES).numpy(),
-            _rows_of_numbers(len(rows.rates)),
+            _row_indices(len(rows.rates)),
         )
         for rows in tensors
     )
@@ -75,13 +87,14 @@ def adam_step_cpu(
 
 
 @cache
-def _rows_of_numbers(numbers: int) -> np.ndarray:
+def _row_indices(numbers: int) -> np.ndarray:
+    """Return the row of each number in LANES rows of `numbers`, as [numbers, LANES]."""
     return (np.arange(numbers * LANES) // numbers).astype(np.float32).reshape(numbers, LANES)
 
 
 @cache
 def _constants(settings: AdamSettings) -> Constants:
-    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), up to a step after which they are 1."""
+    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) up to the step t where both are 1."""
     slowest = max(settings.beta1, settings.beta2, ROUNDING)
     t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))
     t[0] = 1  # unused: a row's first step is 1
@@ -97,12 +110,15 @@ def _constants(settings: AdamSettings) -> Constants:
 
 @kernel
 def update_blocks(start, stop, tensors, visible, constants):
-    """Update the rows of the blocks start to stop; return how many visible ones are not finite.
+    """Update the rows of the blocks start to stop.
 
     Args:
-        tensors: a tuple of `FlatRows`.
+        tensors: tuple of `FlatRows`.
         visible: [N].
         constants: see `Constants`.
+
+    Returns:
+        The number of visible rows with a non-finite gradient.
     """
     alive = np.zeros(BLOCK, np.bool_)
     factors = np.zeros((1, BLOCK, 2), np.float32)
@@ -115,7 +131,7 @@ def update_blocks(start, stop, tensors, visible, constants):
         for k in range(len(tensors)):
             dropped_rows += _drop_not_finite(alive, tensors[k], first)
         for k in range(len(tensors)):
-            _count(factors, alive, tensors[k], first, constants.corrections)
+            _count_steps(factors, alive, tensors[k], first, constants.corrections)
             _update(factors, alive, tensors[k], first, constants)
     return dropped_rows
 
@@ -145,10 +161,10 @@ def _drop_not_finite(alive, tensor, first):
             continue
         begin = (first + row) * numbers
         end = min(begin + rows * numbers, size)
-        nothing = zeros()
+        sums = zeros()  # 0 times a number is NaN unless it is finite
         for i in range(begin, end, LANES):
-            nothing = fma(load_some(tensor.gradient, i, min(LANES, end - i)), ZERO, nothing)
-        if total(nothing) == 0:
+            sums = fma(load_some(tensor.gradient, i, min(LANES, end - i)), ZERO, sums)
+        if total(sums) == 0:
             continue
         for i in range(begin, end):
             local_row = i // numbers - first
@@ -159,8 +175,11 @@ def _drop_not_finite(alive, tensor, first):
 
 
 @inline
-def _count(factors, alive, tensor, first, corrections):
-    """Count each row's step and write its corrections; the first is 0 if the row is not updated."""
+def _count_steps(factors, alive, tensor, first, corrections):
+    """Count the step of each row in `alive`, and write the corrections of all rows to `factors`.
+
+    The mean's is 0 for a row that is not in `alive`.
+    """
     last = np.int32(len(corrections) - 1)
     for row in range(min(len(alive), len(tensor.steps) - first)):
         steps = tensor.steps[first + row] + np.int32(alive[row])
@@ -172,7 +191,7 @@ def _count(factors, alive, tensor, first, corrections):
 
 @inline
 def _update(factors, alive, tensor, first, constants):
-    """Update the `alive` rows."""
+    """Update the rows in `alive`."""
     numbers, size = len(tensor.rates), len(tensor.parameter)
     rows = _rows_at_a_time(numbers)
     for row in range(0, len(alive), rows):

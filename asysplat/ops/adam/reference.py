@@ -14,8 +14,8 @@ class Rows(NamedTuple):
     Args:
         parameter: updated in place, like `mean`, `square` and `steps`.
         gradient: gradient of the loss.
-        mean, square: the decaying averages of the gradient and of its square.
-        steps: number of updates of each row.
+        mean, square: decaying averages of the gradient and of its square.
+        steps: number of updates of each row so far.
         rates: learning rate of each number of a row, >= 0.
     """
 
@@ -28,7 +28,12 @@ class Rows(NamedTuple):
 
 
 class AdamSettings(NamedTuple):
-    """The decay of both averages, in [0, 1), and the term > 0 added to the root of the square."""
+    """The settings of Adam.
+
+    Args:
+        beta1, beta2: decay of `mean` and `square` per step, in [0, 1).
+        eps: number > 0 that is added to the root of the corrected square.
+    """
 
     beta1: float
     beta2: float

@@ -1,4 +1,4 @@
-"""Grid attention as one softmax over all tokens, masked to the tokens at the same grid place."""
+"""Grid attention as one softmax over all tokens, masked to those at the same place in the grid."""
 
 import torch
 from jaxtyping import Float

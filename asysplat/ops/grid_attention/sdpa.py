@@ -1,4 +1,4 @@
-"""Grid attention with each grid place as a batch entry of torch's fused attention."""
+"""Grid attention by torch's fused attention, with a batch entry for each place in the grid."""
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ def grid_attention_sdpa(
     mask = None
     if below or right:
         q, k, v = (F.pad(t, (0, 0, 0, 0, 0, right, 0, below)) for t in (q, k, v))
-        mask = _real_tokens(height, width, grid, q)
+        mask = _mask_padding(height, width, grid, q)
     sizes = {"gh": grid, "gw": grid, "v": views, "h": q.shape[2] // grid}
     q, k, v = (
         rearrange(tensor, "b v (h gh) (w gw) H p -> (b gh gw) H (v h w) p", gh=grid, gw=grid)
@@ -30,10 +30,13 @@ def grid_attention_sdpa(
     return output[:, :, :height, :width]
 
 
-def _real_tokens(
+def _mask_padding(
     height: int, width: int, grid: int, padded: Float[Tensor, "B V h w H P"]
 ) -> Bool[Tensor, "place 1 1 key"]:
-    """Return which keys of a grid place are no padding; all of them if all are padding."""
+    """Return the mask of the keys at each place that are not padding.
+
+    Where all of them are padding it is True, as a softmax over no key is NaN.
+    """
     batch, views, rows, columns = padded.shape[:4]
     real = torch.zeros(rows, columns, dtype=torch.bool, device=padded.device)
     real[:height, :width] = True

@@ -1,14 +1,14 @@
-"""Loss and gradient for CPUs (Numba) in one pass: a task takes a band of rows of a channel.
+"""The loss and its gradient for CPUs (Numba) in one pass: a task takes bands of a channel's rows.
 
-Of the sum s = x + y and the difference d = x - y of both images, with their means S, D and their
-variances V, U in a window, SSIM is
+Let s = x + y be the sum of both images and d = x - y their difference, with means S and D and
+variances V and U in a window. Then SSIM is
 
     (1 - D^2 / P) (1 - U / Q),  P = (S^2 + D^2) / 2 + C1,  Q = (V + U) / 2 + C2.
 
-Nothing cancels where the images are alike, nor in a variance, which is the mean of the variances
-within the window's columns plus the variance of the columns' means. The gradient of 1 - SSIM at
-each pixel is a + b d + c s, where a, b and c are sums over its windows; for one window they follow
-from S, D, V and U.
+No difference of nearly equal numbers is taken where the images are alike, nor for a variance, which
+is the mean of the variances within the window's columns plus the variance of the columns' means.
+The gradient of 1 - SSIM at a pixel is a + b d + c s, where a, b and c are sums over the windows
+that contain the pixel; each window's terms follow from its S, D, V and U.
 """
 
 from typing import NamedTuple
@@ -35,29 +35,29 @@ from asysplat.kernels.simd.vectors import (
 from asysplat.ops.image_loss import reference
 from asysplat.ops.image_loss.reference import SIZE, window_weights
 
-BAND = 64  # rows of a task; for their gradients it also computes the windows that begin above
-REACH = SIZE - 1
+BAND = 64  # rows of a band; their gradients also need the windows that begin above the band
+REACH = SIZE - 1  # rows below the top row of a window
 WINDOW = window_weights().float().numpy()
 C1, C2 = np.float32(reference.C1), np.float32(reference.C2)
 HALF, TWO = np.float32(0.5), np.float32(2)
 
 
 class ImagePair(NamedTuple):
-    """Both images, [channels of all images, H, W]."""
+    """The pairs of images, both [channels of all images, H, W]."""
 
     rendered: np.ndarray
     target: np.ndarray
 
 
 class Weights(NamedTuple):
-    """The weights of a pixel's |d| and a window's 1 - SSIM in the loss."""
+    """The weights in the loss of each pixel's |d| and of each window's 1 - SSIM."""
 
     pixel: np.float32
     window: np.float32
 
 
 class Statistics(NamedTuple):
-    """Means and variances of s and d, [width], over each column of a row of windows."""
+    """Means and variances of s and d, [width], over the columns of SIZE pixels of a window row."""
 
     mean_s: np.ndarray
     mean_d: np.ndarray
@@ -66,7 +66,7 @@ class Statistics(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """The terms of each window in a, b and c, of a row [width], or summed along rows."""
+    """The terms of a row of windows in a, b and c, [width], or their sums, [rows, width]."""
 
     a: np.ndarray
     b: np.ndarray
@@ -84,7 +84,7 @@ def image_loss_cpu(
 
 
 class _ImageLoss(torch.autograd.Function):
-    """The loss, which saves only its gradient for the backward pass."""
+    """The loss as a function of torch, which saves only its gradient for the backward pass."""
 
     @staticmethod
     def forward(ctx, rendered, target, ssim_weight, keep):
@@ -103,8 +103,8 @@ class _ImageLoss(torch.autograd.Function):
             gradient.view(-1, H, W).numpy() if keep else None,
         )
         ctx.save_for_backward(gradient)
-        absolute, dissimilar = sums.view(*rendered.shape[:-3], -1, 2).sum(-2).unbind(-1)
-        return (per_pixel * absolute + per_window * dissimilar).float()
+        error, dissimilarity = sums.view(*rendered.shape[:-3], -1, 2).sum(-2).unbind(-1)
+        return (per_pixel * error + per_window * dissimilarity).float()
 
     @staticmethod
     @once_differentiable
@@ -115,49 +115,47 @@ class _ImageLoss(torch.autograd.Function):
 
 @kernel
 def compare_bands(start, stop, images, weights, sums, gradient):
-    """Compare the bands start to stop, counted over [channels of all images, bands of one].
+    """Compare the bands start to stop, counted over [channels of all images, bands of a channel].
 
     Args:
         images, weights: see `ImagePair` and `Weights`.
-        sums: [bands, 2], written: of |d| over a band's pixels, and of 1 - SSIM over the windows
-            that begin in the band.
+        sums: [bands, 2], written: the sum of |d| over a band's pixels, and that of 1 - SSIM over
+            the windows that begin in the band.
         gradient: gradient of the loss, shaped as `images.rendered`, written; or None.
     """
     _, H, W = images.rendered.shape
     bands = -(-H // BAND)
-    windows = H - REACH if weights.window > ZERO else 0  # rows of them
-    above = REACH if gradient is not None else 0  # rows of windows that overlap a band
+    windows = H - REACH if weights.window > ZERO else 0  # rows of windows
+    above = REACH if gradient is not None else 0  # rows of windows that reach into a band
     width = -(-W // LANES) * LANES
     # Pixels beyond the image, and windows not wholly inside it, are zeros.
     padded = np.zeros((7, width + LANES), np.float32)
     columns = Statistics(padded[0], padded[1], padded[2], padded[3])
     factors = Factors(padded[4], padded[5], padded[6])
     rows = np.zeros((3, BAND + above, width), np.float32)
-    sums_along = Factors(rows[0], rows[1], rows[2])
+    row_sums = Factors(rows[0], rows[1], rows[2])
     for band in range(start, stop):
         plane, top = band // bands, band % bands * BAND
         bottom = min(top + BAND, H)
-        absolute = dissimilar = 0.0
+        error = dissimilarity = 0.0
         for y in range(top - above, bottom):
             row, inside = y - (top - above), 0 <= y < windows
             if inside:
                 _compare_columns(columns, images, (plane * H + y) * W)
-                row_sum = _compare_windows(factors, columns, W - REACH)
-                dissimilar += row_sum if y >= top else 0.0
+                of_row = _compare_windows(factors, columns, W - REACH)
+                dissimilarity += of_row if y >= top else 0.0
             if gradient is not None and inside:
-                _sum_along_row(sums_along, row, factors)
+                _sum_along_row(row_sums, row, factors)
             elif gradient is not None:
                 rows[:, row] = ZERO
         for y in range(top, bottom):
-            absolute += _finish_row(
-                gradient, sums_along, y - top, images, (plane * H + y) * W, weights
-            )
-        sums[band, 0], sums[band, 1] = absolute, dissimilar
+            error += _finish_row(gradient, row_sums, y - top, images, (plane * H + y) * W, weights)
+        sums[band, 0], sums[band, 1] = error, dissimilarity
 
 
 @inline
 def _compare_columns(columns, images, first):
-    """Write the statistics of columns of SIZE pixels whose top row begins at `first`."""
+    """Write the statistics of the columns of SIZE pixels from the image row at `first` down."""
     W = images.rendered.shape[2]
     for x in range(0, W, LANES):
         count = min(LANES, W - x)
@@ -183,7 +181,7 @@ def _compare_columns(columns, images, first):
 @inline
 def _compare_windows(factors, columns, w):
     """Write the factors of a row of `w` windows; return the sum of their 1 - SSIM."""
-    dissimilar = zeros()
+    dissimilarity = zeros()
     for x in range(0, w, LANES):
         S, D = zeros(), zeros()
         for k in range(SIZE):
@@ -201,19 +199,19 @@ def _compare_windows(factors, columns, w):
         means, rest = ONE - D * D_over_P, ONE - U_over_Q
         count = min(LANES, w - x)
         unlike = fma(U_over_Q, means, D * D_over_P)
-        dissimilar = dissimilar + where(np.uint16((1 << count) - 1), unlike, zeros())
+        dissimilarity = dissimilarity + where(np.uint16((1 << count) - 1), unlike, zeros())
         c = means * U_over_Q * over_Q
         b = fma(TWO * means, over_Q, ZERO - c)
         a = rest * D_over_P * (TWO - (S + D) * D_over_P) + (c * S - b * D)
         store_some(factors.a, REACH + x, count, a)
         store_some(factors.b, REACH + x, count, b)
         store_some(factors.c, REACH + x, count, ZERO - c)
-    return total(dissimilar)
+    return total(dissimilarity)
 
 
 @inline
 def _sum_along_row(sums, row, factors):
-    """Write the sums of the factors over each pixel's windows of one row."""
+    """Write the weighted sums of the factors over the windows of a row that contain each pixel."""
     width = sums.a.shape[1]
     for x in range(0, width, LANES):
         a, b, c = zeros(), zeros(), zeros()
@@ -228,18 +226,18 @@ def _sum_along_row(sums, row, factors):
 
 @inline
 def _finish_row(gradient, sums, row, images, first, weights):
-    """Return the sum of |d| over the row of pixels at `first`; write its gradient.
+    """Return the sum of |d| over the row of pixels that begins at `first`; write their gradient.
 
-    Its windows are in `sums` from `row` on.
+    The sums of their windows are the rows of `sums` from `row` on.
     """
     W, width = images.rendered.shape[2], sums.a.shape[1]
-    absolute = zeros()
+    error = zeros()
     for x in range(0, W, LANES):
         count = min(LANES, W - x)
         rendered = load_some(images.rendered, first + x, count)
         target = load_some(images.target, first + x, count)
         d = rendered - target
-        absolute = absolute + max(d, ZERO - d)
+        error = error + max(d, ZERO - d)
         if gradient is not None:
             # The sign of 0 is 0, that of NaN is NaN.
             sign = where(less(zeros(), d), zeros() + ONE, where(less(d, zeros()), zeros() - ONE, d))
@@ -253,4 +251,4 @@ def _finish_row(gradient, sums, row, images, first, weights):
             similar = fma(b, d, fma(c, rendered + target, a))
             grad = fma(weights.window, similar, weights.pixel * sign)
             store_some(gradient, first + x, count, grad)
-    return total(absolute)
+    return total(error)

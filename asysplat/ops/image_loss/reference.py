@@ -5,12 +5,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 SIZE = 11  # pixels along a side of a window
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004, for a data range of 1
+SIGMA = 1.5  # standard deviation of a window's Gaussian in pixels
+C1, C2 = 0.01**2, 0.03**2  # constants of Wang et al. 2004, for a data range of 1
 
 
 def window_weights() -> Float[Tensor, "11"]:
-    """Return the Gaussian along one side of a window, in float64; it sums up to 1."""
+    """Return the Gaussian weights along one side of a window, in float64; they sum to 1."""
     offsets = torch.arange(SIZE, dtype=torch.float64) - SIZE // 2
     weights = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     return weights / weights.sum()
