@@ -1,7 +1,7 @@
 """The selective scan in torch, a chunk of tokens at a time: any device, any float type.
 
-Within a chunk only the recurrence is sequential. The backward pass computes each chunk again, so
-that only the states of one chunk are in memory.
+Within a chunk, only the recurrence is sequential. The backward pass computes each chunk again, so
+that the states of only one chunk are in memory.
 """
 
 import torch
@@ -23,12 +23,12 @@ def selective_scan_chunked(inputs: ScanInputs) -> Float[Tensor, "B L D"]:
     for chunk in zip(
         *(tensor.split(CHECKPOINT_CHUNK, dim=1) for tensor in (x, dt, B, C)), strict=True
     ):
-        y, state = checkpoint(_chunk, *chunk, A, D, state, use_reentrant=False)
+        y, state = checkpoint(_scan_chunk, *chunk, A, D, state, use_reentrant=False)
         outputs.append(y)
     return torch.cat(outputs, 1)
 
 
-def _chunk(
+def _scan_chunk(
     x: Tensor, dt: Tensor, B: Tensor, C: Tensor, A: Tensor, D: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return y of a chunk, and the state after it."""

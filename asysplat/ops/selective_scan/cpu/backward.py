@@ -17,7 +17,7 @@ from asysplat.kernels.simd.vectors import (
     total,
     zeros,
 )
-from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
+from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS, token_at
 
 LN_2 = np.float32(math.log(2))
 
@@ -40,12 +40,12 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
     decays = np.empty(ROWS, np.float32)
     states = np.empty((CACHE_CHUNK + 1, LANES), np.float32)
     g_steps, g_added = np.empty(ROWS, np.float32), np.empty(ROWS, np.float32)
-    passed = np.empty((blocks, state_size, LANES), np.float32)
+    g_states = np.empty((blocks, state_size, LANES), np.float32)  # of the states before a chunk
     while start < stop:
         batch, first_block = start // blocks, start % blocks
         last_block = min(blocks, first_block + stop - start)
         start += last_block - first_block
-        passed[:] = ZERO
+        g_states[:] = ZERO
         grad_A[batch, first_block:last_block] = ZERO
         grad_D[batch, first_block:last_block] = ZERO
         for chunk in range(chunks - 1, -1, -1):
@@ -56,7 +56,7 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
                 first = block * LANES
                 width = min(LANES, channels - first)
                 for k in range(count):
-                    t = length - 1 - begin - k if reverse else begin + k
+                    t = token_at(begin + k, length, reverse)
                     place = (batch * length + t) * channels + first
                     step, value = load_some(dt, place, width), load_some(x, place, width)
                     store(steps, k, step)
@@ -68,29 +68,29 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
                 for n in range(state_size):
                     rate, value = load(rates, n), load(saved_state[batch, block, chunk], n)
                     for k in range(count):
-                        t = length - 1 - begin - k if reverse else begin + k
+                        t = token_at(begin + k, length, reverse)
                         decay = decay2(load(steps, k) * rate)
                         store(decays, k, decay)
                         store(states, k, value)
                         value = fma(decay, value, load(added, k) * B[batch, t, n])
                     store(states, count, value)
-                    later, g_rate = load(passed[block], n), zeros()
+                    later, g_rate = load(g_states[block], n), zeros()
                     for k in range(count - 1, -1, -1):
-                        t = length - 1 - begin - k if reverse else begin + k
+                        t = token_at(begin + k, length, reverse)
                         g_state = fma(C[batch, t, n], load(outs, k), later)
                         grad_B[block, batch, t, n] = total(g_state * load(added, k))
                         grad_C[block, batch, t, n] = total(load(outs, k) * load(states, k + 1))
                         store(g_added, k, fma(g_state, B[batch, t, n], load(g_added, k)))
                         later = g_state * load(decays, k)
-                        # The base of the exponent is 2: A has the factor log2(e).
+                        # `rate` has the factor log2(e), which LN_2 removes from g_steps below.
                         g_log = later * load(states, k)
                         store(g_steps, k, fma(g_log, rate, load(g_steps, k)))
                         g_rate = fma(g_log, load(steps, k), g_rate)
-                    store(passed[block], n, later)
+                    store(g_states[block], n, later)
                     store(g_rates, n, load(g_rates, n) + g_rate)
                 skip, g_skip = load(D[block], 0), zeros()
                 for k in range(count):
-                    t = length - 1 - begin - k if reverse else begin + k
+                    t = token_at(begin + k, length, reverse)
                     place = (batch * length + t) * channels + first
                     g_input, value = load(g_added, k), load(values, k)
                     g_step = fma(g_input, value, load(g_steps, k) * LN_2)

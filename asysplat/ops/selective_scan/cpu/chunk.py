@@ -6,21 +6,22 @@ import numpy as np
 import torch.nn.functional as F
 from torch import Tensor
 
+from asysplat.kernels.simd.threads import inline
 from asysplat.kernels.simd.vectors import LANES
 
-CACHE_CHUNK = 32  # tokens: arrays of CACHE_CHUNK x LANES fit a core's first cache
+CACHE_CHUNK = 32  # tokens of a chunk, whose arrays of CACHE_CHUNK x LANES fit into the L1 cache
 ROWS = (CACHE_CHUNK, LANES)
 
 
 class BlockedInputs(NamedTuple):
-    """The inputs of a scan in float32; zeros fill up the last block of channels.
+    """The inputs of a scan in float32; zeros fill the last block of channels.
 
     Args:
         x, dt: [B, L, D].
-        A: [blocks, N, LANES], times log2(e).
+        A: [blocks, N, LANES], multiplied by log2(e), for decays as powers of 2.
         B, C: [B, L, N].
         D: [blocks, 1, LANES].
-        reverse: the scan goes from the last token to the first.
+        reverse: True if the scan goes from the last token to the first.
     """
 
     x: np.ndarray
@@ -33,7 +34,7 @@ class BlockedInputs(NamedTuple):
 
 
 class BlockedGradients(NamedTuple):
-    """The gradients: of B and C for each block, of A and D for each sequence.
+    """The gradients of the inputs, to be summed: B and C over blocks, A and D over sequences.
 
     Args:
         x, dt: [B, L, D].
@@ -50,12 +51,18 @@ class BlockedGradients(NamedTuple):
     D: np.ndarray
 
 
-def by_block(per_channel: Tensor) -> Tensor:
-    """Rearrange [D, n] to [blocks of channels, n, LANES], filled up with zeros."""
+@inline
+def token_at(position, length, reverse):
+    """Return the index of the token at a position of the scan."""
+    return length - 1 - position if reverse else position
+
+
+def split_blocks(per_channel: Tensor) -> Tensor:
+    """Rearrange [D, n] to [blocks of channels, n, LANES], where zeros fill the last block."""
     padded = F.pad(per_channel, (0, 0, 0, -len(per_channel) % LANES))
     return padded.unflatten(0, (-1, LANES)).mT.contiguous()
 
 
-def by_channel(per_block: Tensor) -> Tensor:
-    """Rearrange [blocks of channels, n, LANES] to [D, n], with the last block's padding."""
+def join_blocks(per_block: Tensor) -> Tensor:
+    """Rearrange [blocks of channels, n, LANES] to [blocks x LANES, n]."""
     return per_block.mT.flatten(0, 1)

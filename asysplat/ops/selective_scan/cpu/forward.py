@@ -13,17 +13,18 @@ from asysplat.kernels.simd.vectors import (
     store,
     store_some,
 )
-from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
+from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS, token_at
 
 
 @kernel
 def forward_blocks(start, stop, inputs, y, saved_state):
-    """Write y and the states of the blocks start to stop, counted over [B, blocks of channels].
+    """Write y of the blocks start to stop, counted over [B, blocks of channels].
 
     Args:
         inputs: see `BlockedInputs`.
-        y: [B, L, D].
-        saved_state: [B, blocks, chunks, N, LANES] at the beginning of each chunk, or empty.
+        y: [B, L, D], written.
+        saved_state: [B, blocks, chunks, N, LANES] states at the start of each chunk, written; or
+            empty.
     """
     x, dt, A, B, C, D, reverse = inputs
     length, channels = x.shape[1:]
@@ -47,7 +48,7 @@ def forward_blocks(start, stop, inputs, y, saved_state):
                 first = block * LANES
                 width = min(LANES, channels - first)
                 for k in range(count):
-                    t = length - 1 - begin - k if reverse else begin + k
+                    t = token_at(begin + k, length, reverse)
                     place = (batch * length + t) * channels + first
                     step, value = load_some(dt, place, width), load_some(x, place, width)
                     store(steps, k, step)
@@ -57,13 +58,13 @@ def forward_blocks(start, stop, inputs, y, saved_state):
                 for n in range(state_size):
                     rate, value = load(rates, n), load(state, n)
                     for k in range(count):
-                        t = length - 1 - begin - k if reverse else begin + k
+                        t = token_at(begin + k, length, reverse)
                         decay = decay2(load(steps, k) * rate)
                         value = fma(decay, value, load(added, k) * B[batch, t, n])
                         store(out, k, fma(C[batch, t, n], value, load(out, k)))
                     store(state, n, value)
                 skip = load(D[block], 0)
                 for k in range(count):
-                    t = length - 1 - begin - k if reverse else begin + k
+                    t = token_at(begin + k, length, reverse)
                     place = (batch * length + t) * channels + first
                     store_some(y, place, width, fma(skip, load(values, k), load(out, k)))

@@ -1,4 +1,4 @@
-"""Both passes: the arrays of the kernels."""
+"""Both passes: the kernels' arrays and runs."""
 
 import math
 
@@ -14,8 +14,8 @@ from asysplat.ops.selective_scan.cpu.chunk import (
     CACHE_CHUNK,
     BlockedGradients,
     BlockedInputs,
-    by_block,
-    by_channel,
+    join_blocks,
+    split_blocks,
 )
 from asysplat.ops.selective_scan.cpu.forward import forward_blocks
 
@@ -39,7 +39,7 @@ def forward(
     run_blocks(
         forward_blocks,
         even_bounds(shape[0] * shape[1]),
-        _blocked(inputs, reverse),
+        _split_inputs(inputs, reverse),
         y.numpy(),
         saved_state.numpy(),
     )
@@ -54,16 +54,16 @@ def backward(
     batch, length, channels = x.shape
     blocks, state_size = saved_state.shape[1], B.shape[-1]
     grad_x, grad_dt = (torch.empty(x.shape, dtype=torch.float32) for _ in range(2))
-    # Sums over channels: each block of channels has its own part.
+    # The gradients of B and C are sums over all channels: each block writes its own part.
     part_B, part_C = (torch.empty(blocks, batch, length, state_size) for _ in range(2))
     grad_A = torch.empty(batch, blocks, state_size, LANES)
     grad_D = torch.empty(batch, blocks, 1, LANES)
     run_blocks(
         backward_blocks,
         even_bounds(batch * blocks),
-        _blocked(inputs, reverse),
+        _split_inputs(inputs, reverse),
         saved_state.numpy(),
-        _float32(grad_output).numpy(),
+        _to_float32(grad_output).numpy(),
         BlockedGradients(
             *(part.numpy() for part in (grad_x, grad_dt, grad_A, part_B, part_C, grad_D))
         ),
@@ -71,25 +71,25 @@ def backward(
     return ScanInputs(
         x=grad_x.to(x.dtype),
         dt=grad_dt,
-        A=by_channel(grad_A.sum(0))[:channels],
+        A=join_blocks(grad_A.sum(0))[:channels],
         B=part_B.sum(0).to(B.dtype),
         C=part_C.sum(0).to(C.dtype),
-        D=by_channel(grad_D.sum(0))[:channels, 0],
+        D=join_blocks(grad_D.sum(0))[:channels, 0],
     )
 
 
-def _blocked(inputs: ScanInputs, reverse: bool) -> BlockedInputs:
-    x, dt, B, C = map(_float32, (inputs.x, inputs.dt, inputs.B, inputs.C))
+def _split_inputs(inputs: ScanInputs, reverse: bool) -> BlockedInputs:
+    x, dt, B, C = map(_to_float32, (inputs.x, inputs.dt, inputs.B, inputs.C))
     return BlockedInputs(
         x=x.numpy(),
         dt=dt.numpy(),
-        A=by_block(inputs.A * LOG2_E).numpy(),
+        A=split_blocks(inputs.A * LOG2_E).numpy(),
         B=B.numpy(),
         C=C.numpy(),
-        D=by_block(inputs.D[:, None]).numpy(),
+        D=split_blocks(inputs.D[:, None]).numpy(),
         reverse=reverse,
     )
 
 
-def _float32(tensor: Tensor) -> Tensor:
+def _to_float32(tensor: Tensor) -> Tensor:
     return tensor.float().contiguous()

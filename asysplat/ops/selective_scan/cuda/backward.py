@@ -3,7 +3,12 @@
 import triton.language as tl
 
 from asysplat.kernels.triton_utils import kernel
-from asysplat.ops.selective_scan.cuda.chunk import load_channels, load_projection, place, row_at
+from asysplat.ops.selective_scan.cuda.chunk import (
+    load_channels,
+    load_projection,
+    locate,
+    row_at,
+)
 
 
 @kernel
@@ -32,17 +37,17 @@ def backward_chunk(
 ):
     """Write the gradients for a chunk and a block of channels.
 
-    The caller sums over chunks and blocks.
+    The caller sums those of A and D over sequences and chunks, and those of B and C over blocks.
 
     Args:
         grad_output, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
-        states: [B, chunks, D, N] before each chunk.
-        grad_states: [B, chunks, D, N], the gradients of the states after each chunk.
+        states: [B, chunks, D, N] states before each chunk.
+        grad_states: [B, chunks, D, N] gradients of the states after each chunk.
         grad_x, grad_dt: [B, L, D].
         grad_A, grad_D: [B, chunks, D, N] and [B, chunks, D].
         grad_B, grad_C: [B, L, blocks, N].
     """
-    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
     skip = tl.load(D + channel, mask=exists, other=0.0)
     row = (batch * tl.num_programs(0) + chunk) * channels

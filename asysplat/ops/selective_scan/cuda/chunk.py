@@ -1,4 +1,4 @@
-"""The indices of a program: a chunk of a sequence, and a block of its channels."""
+"""The indices of a program, which takes a block of channels through a chunk of a sequence."""
 
 import triton.language as tl
 
@@ -6,8 +6,8 @@ from asysplat.kernels.triton_utils import kernel, tokens_at
 
 
 @kernel
-def place(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
-    """Return batch entry, chunk, channels, which of them exist, and their places in [D, N]."""
+def locate(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
+    """Return sequence, chunk, channels, which of them exist, and their states' places in [D, N]."""
     chunk = tl.program_id(0)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(2).to(tl.int64)
@@ -24,12 +24,12 @@ def row_at(batch, position, length, size, REVERSE: tl.constexpr):
 
 @kernel
 def load_channels(array, row, limit, channel):
-    """Return fp32 [BLOCK] of a row, 0 from `limit` on."""
+    """Return the row's numbers at `channel` in fp32; 0 from `limit` on."""
     return tl.load(array + row + channel, mask=channel < limit, other=0.0).to(tl.float32)
 
 
 @kernel
 def load_projection(array, batch, position, length, STATE: tl.constexpr, REVERSE: tl.constexpr):
-    """Return fp32 [1, STATE] of an array [B, L, N], 0 if there is no token."""
+    """Return a token's row of an array [B, L, N] as fp32 [1, STATE]; 0 if there is no token."""
     row, limit = row_at(batch, position, length, STATE, REVERSE)
     return load_channels(array, row, limit, tl.arange(0, STATE))[None, :]

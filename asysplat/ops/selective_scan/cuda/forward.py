@@ -1,15 +1,20 @@
 """The state before each chunk, and the output of each chunk from its tokens and that state.
 
-With GRADIENT the kernels go through each chunk from its end, and pass on the gradient of the state
-before a token.
+With GRADIENT, the kernels go from the last chunk to the first and through each chunk from its end,
+and pass on the gradient of the state before a token.
 """
 
 import triton.language as tl
 
 from asysplat.kernels.triton_utils import kernel
-from asysplat.ops.selective_scan.cuda.chunk import load_channels, load_projection, place, row_at
+from asysplat.ops.selective_scan.cuda.chunk import (
+    load_channels,
+    load_projection,
+    locate,
+    row_at,
+)
 
-AHEAD = tl.constexpr(8)  # chunks
+AHEAD = tl.constexpr(8)  # chunks that a program loads at once
 
 
 @kernel
@@ -32,10 +37,10 @@ def sum_chunk(
 
     Args:
         values, projections: x [B, L, D] and B [B, L, N]; with GRADIENT, grad_output and C.
-        states: [B, chunks, D, N], what the tokens add.
-        steps: [B, chunks, D], the sum of dt.
+        states: [B, chunks, D, N], written: what the tokens add.
+        steps: [B, chunks, D], written: the sum of dt.
     """
-    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
     state = tl.zeros_like(rate)
     total = tl.zeros((BLOCK,), tl.float32)
@@ -111,9 +116,9 @@ def forward_chunk(
 
     Args:
         x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
-        states: [B, chunks, D, N] before each chunk.
+        states: [B, chunks, D, N] states before each chunk.
     """
-    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
     skip = tl.load(D + channel, mask=exists, other=0.0)
     row = (batch * tl.num_programs(0) + chunk) * channels

@@ -1,4 +1,4 @@
-"""Both passes: the arrays and launches of the kernels."""
+"""Both passes: the kernels' arrays and launches."""
 
 import torch
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan.cuda.backward import backward_chunk
 from asysplat.ops.selective_scan.cuda.forward import forward_chunk, pass_states, sum_chunk
 
-# Tokens of a chunk; the backward pass keeps all their states in registers.
+# Tokens of a chunk in each pass; the backward pass keeps the states of all of them in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)
 TILE = 256  # numbers of the state in a program
-PASSED = 128  # numbers of the state in a program that passes states from chunk to chunk
-WARP = {"num_warps": 1, **FUSED}  # no sum leaves a warp
+PASS_TILE = 128  # numbers of the state in a program of `pass_states`
+LAUNCH = {"num_warps": 1, **FUSED}  # all sums of a program stay in one warp
 
 
 def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple[int]:
@@ -28,7 +28,7 @@ def forward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
-        states = _states(x, dt, A, B, FORWARD_CHUNK, reverse, gradient=False)
+        states = _compute_states(x, dt, A, B, FORWARD_CHUNK, reverse, gradient=False)
         arrays = (x, dt, A, B, C, D, states, y)
         forward_chunk[_grid(states)](
             *arrays, *x.shape[1:], CHUNK=FORWARD_CHUNK, **_tile(states, reverse)
@@ -47,8 +47,8 @@ def backward(
     grad_output = grad_output.contiguous()
     grad_x, grad_dt = torch.empty_like(x), torch.empty_like(dt)
     with torch.cuda.device_of(x):
-        states = _states(x, dt, A, B, BACKWARD_CHUNK, reverse, gradient=False)
-        grad_states = _states(grad_output, dt, A, C, BACKWARD_CHUNK, reverse, gradient=True)
+        states = _compute_states(x, dt, A, B, BACKWARD_CHUNK, reverse, gradient=False)
+        grad_states = _compute_states(grad_output, dt, A, C, BACKWARD_CHUNK, reverse, gradient=True)
         grad_A, grad_D = torch.empty_like(states), states.new_empty(states.shape[:3])
         grid = _grid(states)
         parts = (*x.shape[:2], grid[1], B.shape[2])
@@ -78,7 +78,7 @@ def backward(
     )
 
 
-def _states(
+def _compute_states(
     values: Tensor,
     dt: Tensor,
     A: Tensor,
@@ -98,12 +98,12 @@ def _states(
         CHUNK=chunk,
         **_tile(states, reverse),
     )
-    pass_states[(-(-channels * state // PASSED), batch)](
+    pass_states[(-(-channels * state // PASS_TILE), batch)](
         *(A, steps, states, chunks, channels),
         GRADIENT=gradient,
         STATE=state,
-        BLOCK=PASSED,
-        **WARP,
+        BLOCK=PASS_TILE,
+        **LAUNCH,
     )
     return states
 
@@ -115,4 +115,4 @@ def _grid(states: Tensor) -> tuple[int, int, int]:
 
 def _tile(states: Tensor, reverse: bool) -> dict[str, int | bool]:
     state = states.shape[-1]
-    return {"REVERSE": reverse, "STATE": state, "BLOCK": TILE // state, **WARP}
+    return {"REVERSE": reverse, "STATE": state, "BLOCK": TILE // state, **LAUNCH}
