@@ -49,10 +49,10 @@ def _into_chunks(tensor: Tensor) -> Tensor:
 
 
 def _decay_between(exponents: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
-    """Return exp of the sum of exponents from token s (without) to token t >= s; 0 for later s.
+    """Return [b c t s h], exp of the sum of exponents after token s up to t; 0 where s > t.
 
-    They are sums, not differences of sums from the chunk's start, in which a huge step would leave
-    its rounding error.
+    Each exponent is summed directly: in a difference of two sums from the chunk's start, a huge
+    step would leave its rounding error.
     """
     q = exponents.shape[2]
     ones = torch.ones(q, q, dtype=torch.bool, device=exponents.device)

@@ -50,14 +50,14 @@ class GroupGradients(NamedTuple):
 def backward_heads(
     start, stop, segment, saved_state, grad_output, grad_states, head_grads, group_grads
 ):
-    """Write the gradients of the groups start to stop of heads.
+    """Write the gradients for the groups of heads from start to stop.
 
     Args:
         segment: see `Segment`.
         saved_state: [h, N, width] states before the segment.
         grad_output: [l, h, p].
-        grad_states: [h, N, width] of the states after the segment, overwritten by the gradients of
-            the states before it.
+        grad_states: [h, N, width] gradients of the states after the segment, overwritten by those
+            of the states before it.
         head_grads, group_grads: see `HeadGradients` and `GroupGradients`.
     """
     x, dt, A, B, C, D = segment.x, segment.dt, segment.A, segment.B, segment.C, segment.D
@@ -103,7 +103,7 @@ def backward_heads(
                 inputs[:] = values
                 scale_rows(inputs, dt[begin : begin + size, head])
 
-                # Through the scores, within the chunk.
+                # Gradients through the scores, within the chunk.
                 transpose(inputs, inputs_T)
                 add_product(grad_weights, grads, inputs_T, ZERO)
                 grad_scores = part_scores[chunk, group]
@@ -112,7 +112,7 @@ def backward_heads(
                 )
                 weigh_scores(scores[chunk], high, low, reverse, weights)
 
-                # Through the state after the chunk.
+                # Gradients through the state after the chunk.
                 scale_rows(inputs, to_end)
                 add_product(grad_inputs, B[chunk], grad_state, ZERO)
                 for t in range(size):
@@ -122,7 +122,8 @@ def backward_heads(
                 transpose(grad_state, state_T)
                 add_product(part_B[chunk, group], inputs, state_T, part_of_others)
 
-                # Through the state before the chunk: what remains of it, and what the tokens read.
+                # Gradients through the state before the chunk: what of it remains after the chunk,
+                # and what the tokens read of it.
                 remaining = 0.0
                 for n in range(state_size):
                     remaining += dot_rows(states[chunk], grad_state, n)
@@ -151,10 +152,15 @@ def backward_heads(
 
 @inline
 def add_sums(before, after, reverse, grad_logs):
-    """Add the part through the states to the gradient of each token's log decay.
+    """Add the gradients through the states to those of each token's log decay.
 
-    A token's decay acts on what earlier tokens wrote and what it and later tokens read. Both are
-    summed directly: differences of sums would keep the rounding error of the largest.
+    A token's decay acts on what earlier tokens write to the state after the chunk, and on what it
+    and later tokens read from the state before the chunk. Both are summed directly: differences of
+    sums would keep the rounding error of the largest.
+
+    Args:
+        before: [q], what each token writes times its gradient.
+        after: [q], what each token reads times its gradient.
     """
     size = len(grad_logs)
     written = read = 0.0

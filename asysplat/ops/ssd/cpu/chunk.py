@@ -1,7 +1,4 @@
-"""The arrays of a chunk: its inputs, the rows of a head's tokens, and the decays between them.
-
-The decays turn scores into weights.
-"""
+"""The inputs of a segment's chunks, and the decays between their tokens, which weigh the scores."""
 
 import math
 from typing import NamedTuple
@@ -20,9 +17,9 @@ class Decays(NamedTuple):
     Args:
         high, low: [c, h, q] log2 of the decay since the start of the chunk, as the sum of two
             numbers: a huge step leaves no rounding error in later decays.
-        from_start: [c, h, q] from the start of the chunk, in scan order, to a token.
-        to_end: [c, h, q] from a token to the end of the chunk.
-        across: [c, h] of the whole chunk.
+        from_start: [c, h, q] decay from the start of the chunk, in scan order, to a token.
+        to_end: [c, h, q] decay from a token to the end of the chunk.
+        across: [c, h] decay of the whole chunk.
     """
 
     high: np.ndarray
@@ -33,16 +30,16 @@ class Decays(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The inputs of a scan for c chunks of q tokens, l in all; float32.
+    """The inputs of a scan for c chunks of q tokens, l = c q in all; float32.
 
     Args:
         x: [l, h, p].
         dt: [l, h].
         A, D: [h].
         B, C: [c, q, N].
-        scores: [c, q, q] C B^T, of token t (row) and s.
-        decays: between the tokens.
-        reverse: the scan goes from the last token to the first.
+        scores: [c, q, q] products C_t . B_s of tokens t (row) and s (column).
+        decays: decays within each chunk.
+        reverse: True if the scan goes from the last token to the first.
     """
 
     x: np.ndarray
@@ -58,7 +55,7 @@ class Segment(NamedTuple):
 
 @inline
 def take_rows(tensor, begin, head, rows):
-    """Copy a head's values for a chunk's tokens, from token `begin` of [l, h, p] on."""
+    """Copy a head's values of `tensor` [l, h, p] to `rows`, from token `begin` on."""
     for t in range(len(rows)):
         for i in range(tensor.shape[2]):
             rows[t, i] = tensor[begin + t, head, i]
@@ -66,7 +63,7 @@ def take_rows(tensor, begin, head, rows):
 
 @inline
 def scale_rows(rows, factors):
-    """Multiply each row by its factor."""
+    """Multiply each row by its factor, in place."""
     for t in range(len(rows)):
         for i in range(rows.shape[1]):
             rows[t, i] *= factors[t]
@@ -74,7 +71,7 @@ def scale_rows(rows, factors):
 
 @inline
 def dot_rows(a, b, t):
-    """Return the dot product of row t of both, which are contiguous and in whole vectors."""
+    """Return the dot product of row t of `a` and of `b`, contiguous arrays of whole vectors."""
     vectors = a.shape[1] // LANES
     value = zeros()
     for i in range(t * vectors, (t + 1) * vectors):
@@ -94,15 +91,15 @@ def sum_decays(dt: Float[Tensor, "c q h"], A: Float[Tensor, "h"], reverse: bool)
 
 @inline
 def decay_between(high, low, t, s, reverse):
-    """Return the decay from token s to token t, 0 where s comes later; high, low: `Decays`."""
+    """Return the decay from token s to token t, 0 where s comes later (high, low: see `Decays`)."""
     before = s >= t if reverse else s <= t
     exponent = (high[t] - high[s]) + (low[t] - low[s])
     return decay2(min(exponent, ZERO)) * (ONE if before else ZERO)
 
 
 @inline
-def range_before(t, size, reverse):
-    """Return the range of tokens before t in scan order, with t, widened to whole vectors."""
+def range_up_to(t, size, reverse):
+    """Return the range of the tokens up to t in scan order, widened to whole vectors."""
     if reverse:
         return t // LANES * LANES, size
     return 0, (t // LANES + 1) * LANES
@@ -110,16 +107,16 @@ def range_before(t, size, reverse):
 
 @inline
 def weigh_scores(scores, high, low, reverse, weights):
-    """Write `weights`, the scores times the decays, in the `range_before` each token.
+    """Write the products of scores and decays to `weights`, for each token t in its `range_up_to`.
 
     Args:
-        scores, weights: [q, q] of token t (row) and s.
+        scores, weights: [q, q] numbers of tokens t (row) and s (column).
         high, low: [q], see `Decays`.
-        reverse: the scan goes from the last token to the first.
+        reverse: True if the scan goes from the last token to the first.
     """
     size = len(scores)
     for t in range(size):
-        first, last = range_before(t, size, reverse)
+        first, last = range_up_to(t, size, reverse)
         for base in range(first, last, LANES):
             for i in range(LANES):
                 decay = decay_between(high, low, t, base + i, reverse)
@@ -133,14 +130,14 @@ def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores,
     Args:
         grad_weights, scores: [q, q].
         grad_scores: [q, q], added to.
-        grad_logs: [q] float64, written: the gradient of each token's dt A.
+        grad_logs: [q] float64, written: gradient of each token's dt A.
     """
     size = len(scores)
     grads = np.empty(LANES, np.float32)
     column = np.zeros(size)
     for k in range(size):
         t = k if reverse else size - 1 - k  # from the last in scan order
-        first, last = range_before(t, size, reverse)
+        first, last = range_up_to(t, size, reverse)
         for base in range(first, last, LANES):
             for i in range(LANES):
                 decay = decay_between(high, low, t, base + i, reverse)
@@ -148,7 +145,7 @@ def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores,
                 grad_scores[t, base + i] += grads[i]
             for i in range(LANES):
                 column[base + i] += float(grads[i] * scores[t, base + i])
-        # The decay of t is part of every decay from a token before it to itself or a later token.
+        # The decay of t is part of every decay from an earlier token to t or to a later token.
         total = 0.0
         for s in range(t + 1 if reverse else 0, size if reverse else t):
             total += column[s]

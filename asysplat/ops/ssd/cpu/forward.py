@@ -18,7 +18,7 @@ def forward_heads(start, stop, segment, states, y):
 
     Args:
         segment: see `Segment`.
-        states: [h, N, width] before the segment, overwritten by those after it.
+        states: [h, N, width] states before the segment, overwritten by those after it.
         y: [l, h, p].
     """
     x, dt, B, C, D = segment.x, segment.dt, segment.B, segment.C, segment.D

@@ -1,4 +1,4 @@
-"""Both passes over a sequence: segment by segment of chunks, the heads in parallel."""
+"""Both passes over a sequence: a segment of chunks at a time, with the heads in parallel."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,14 +17,14 @@ from asysplat.ops.ssd.cpu.backward import GroupGradients, HeadGradients, backwar
 from asysplat.ops.ssd.cpu.chunk import Segment, sum_decays
 from asysplat.ops.ssd.cpu.forward import forward_heads
 
-SEGMENT = 16 * CHUNK  # tokens; a head's states before these chunks are 1 MB at paper scale
-GROUP = 2  # heads whose gradients of B and C one core sums
+SEGMENT = 16 * CHUNK  # tokens: a head's states before a segment's chunks are 1 MB at paper scale
+GROUP = 2  # heads of a group: one core sums their gradients of B and C
 
 
 def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple:
     """Return the shape of the states before segments, [B, segments, H, N, P in whole vectors]."""
     batch, length, heads, head_dim = x.shape
-    return batch, -(-length // SEGMENT), heads, B.shape[-1], _whole_vectors(head_dim)
+    return batch, -(-length // SEGMENT), heads, B.shape[-1], _round_up_to_vectors(head_dim)
 
 
 def forward(
@@ -36,11 +36,11 @@ def forward(
     saved_state = torch.empty(shape if keep else (0,) * len(shape))
     for batch in range(len(y)):
         states = torch.zeros(shape[2:])
-        for index, tokens in _segments(y.shape[1], reverse):
+        for index, tokens in _iterate_segments(y.shape[1], reverse):
             if keep:
                 saved_state[batch, index] = states
-            segment = _segment(inputs, batch, tokens, reverse)
-            with _whole_target(y[batch, tokens], len(segment.x)) as out:
+            segment = _make_segment(inputs, batch, tokens, reverse)
+            with _open_target(y[batch, tokens], len(segment.x)) as out:
                 run_blocks(forward_heads, np.arange(len(states) + 1), segment, states.numpy(), out)
     return y, saved_state
 
@@ -62,23 +62,23 @@ def backward(
     groups, chunks = -(-len(A) // GROUP), SEGMENT // CHUNK
     group_grads = [
         torch.empty(chunks, groups, CHUNK, columns)
-        for columns in (_whole_vectors(state_size), _whole_vectors(state_size), CHUNK)
+        for columns in (_round_up_to_vectors(state_size), _round_up_to_vectors(state_size), CHUNK)
     ]
     for batch in range(len(grad_output)):
         grad_states = torch.zeros(saved_state.shape[2:])
-        for index, tokens in reversed(list(_segments(grad_output.shape[1], reverse))):
-            segment = _segment(inputs, batch, tokens, reverse)
+        for index, tokens in reversed(list(_iterate_segments(grad_output.shape[1], reverse))):
+            segment = _make_segment(inputs, batch, tokens, reverse)
             length, parts = len(segment.x), [part[: len(segment.B)] for part in group_grads]
             with (
-                _whole_target(grads.x[batch, tokens], length) as grad_x,
-                _whole_target(grads.dt[batch, tokens], length) as grad_dt,
+                _open_target(grads.x[batch, tokens], length) as grad_x,
+                _open_target(grads.dt[batch, tokens], length) as grad_dt,
             ):
                 run_blocks(
                     backward_heads,
                     np.arange(groups + 1),
                     segment,
                     saved_state[batch, index].numpy(),
-                    _whole_chunks(grad_output[batch, tokens]).numpy(),
+                    _pad_to_chunks(grad_output[batch, tokens]).numpy(),
                     grad_states.numpy(),
                     HeadGradients(grad_x, grad_dt, grads.A.numpy(), grads.D.numpy()),
                     GroupGradients(*(part.numpy() for part in parts)),
@@ -91,20 +91,21 @@ def backward(
     return grads._replace(A=grads.A.float(), D=grads.D.float())
 
 
-def _segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]:
+def _iterate_segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]:
     """Yield each segment's index and tokens, in scan order."""
     indices = range(-(-length // SEGMENT))
     for index in reversed(indices) if reverse else indices:
         yield index, slice(index * SEGMENT, min((index + 1) * SEGMENT, length))
 
 
-def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Segment:
+def _make_segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Segment:
     """Return a segment of one sequence, padded to whole chunks.
 
     Padding has dt = 0: it neither decays the state nor adds to it.
     """
     x, dt, B, C = (
-        _whole_chunks(tensor[batch, tokens]) for tensor in (inputs.x, inputs.dt, inputs.B, inputs.C)
+        _pad_to_chunks(tensor[batch, tokens])
+        for tensor in (inputs.x, inputs.dt, inputs.B, inputs.C)
     )
     B, C = B.unflatten(0, (-1, CHUNK)), C.unflatten(0, (-1, CHUNK))
     return Segment(
@@ -120,7 +121,7 @@ def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Se
     )
 
 
-def _whole_chunks(tokens: Tensor) -> Tensor:
+def _pad_to_chunks(tokens: Tensor) -> Tensor:
     """Return [l ...] in fp32, padded with zeros to whole chunks."""
     missing = -len(tokens) % CHUNK
     if missing:
@@ -128,14 +129,17 @@ def _whole_chunks(tokens: Tensor) -> Tensor:
     return tokens.float().contiguous()
 
 
-def _whole_vectors(count: int | torch.SymInt) -> int | torch.SymInt:
+def _round_up_to_vectors(count: int | torch.SymInt) -> int | torch.SymInt:
     """Round a number of columns up to whole vectors."""
     return -(-count // LANES) * LANES
 
 
 @contextmanager
-def _whole_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
-    """Yield an fp32 array of `length` tokens, whose content is copied to `target`."""
+def _open_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
+    """Yield an fp32 array of `length` tokens: `target`, or an array that is then copied to it.
+
+    The tokens of the array fill whole chunks; `target` may have fewer, and another type.
+    """
     if len(target) == length and target.dtype == torch.float32:
         yield target.numpy()
         return

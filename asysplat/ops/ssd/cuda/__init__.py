@@ -1,7 +1,7 @@
 """SSD for GPUs (Triton): matrix products within chunks, the state passed on between them.
 
-Dao and Gu 2024, Section 6. Decays are fp32 differences of sums from the chunk's start, which
-are kept to 48 bits; every exponent is <= 0. The backward pass needs nothing but the inputs.
+Dao and Gu 2024, Section 6. Log decays are differences of sums from the chunk's start, each kept in
+two fp32 numbers, to 48 bits; every exponent is <= 0. The backward pass needs only the inputs.
 """
 
 from asysplat.ops.ssd.cuda.scan import backward, forward, saved_state_shape

@@ -1,4 +1,4 @@
-"""The gradients of x, dt, A and D, which each head has of its own, then of the shared B and C."""
+"""The gradients of x, dt, A and D of each head, and of B and C, which all heads share."""
 
 import triton.language as tl
 
@@ -46,15 +46,15 @@ def head_gradients(
 ):
     """Write the gradients of x, dt, A and D for a chunk and a head.
 
-    The gradient of a token's log decay is the sum over all pairs of an earlier input and an output
-    at or after it, summed directly, never as a difference of larger sums.
+    The gradient of a token's log decay is a sum over all pairs of an input before the token and an
+    output at or after it. It is summed directly, never as a difference of larger sums.
 
     Args:
         grad_output, x, A, B, C, D: see `asysplat.ops.ssd`.
         decays: see `sum_decays`.
         scores: see `score_chunk`.
-        states: [B, chunks, H, P, N] before each chunk.
-        grad_states: [B, chunks, H, P, N], the gradients of the states after each chunk.
+        states: [B, chunks, H, P, N] states before each chunk.
+        grad_states: [B, chunks, H, P, N] gradients of the states after each chunk.
         grad_x, grad_dt: [B, L, H, P] and [B, L, H], written.
         grad_A, grad_D: [B, chunks, H], written, to be summed over sequences and chunks.
     """
@@ -65,7 +65,7 @@ def head_gradients(
     step = tl.load(row + STEP * positions + lane)
     part = (batch * chunks + chunk) * heads + head
 
-    # Through the states: into the chunk, out of it, and across it.
+    # Gradients through the states: from before the chunk, to after it, and across it.
     grad_input = tl.zeros((CHUNK, HEAD_DIM), tl.float32)
     read = tl.zeros((CHUNK, HEAD_DIM), tl.float32)
     through = tl.zeros((HEAD_DIM,), tl.float32)
@@ -87,7 +87,7 @@ def head_gradients(
     flows_out = step * tl.sum(grad_input * value.to(tl.float32), 1)
     flows_across = tl.exp(tl.load(row + SINCE * positions + CHUNK - 1)) * tl.sum(through, 0)
 
-    # Within the chunk, from position s to position t.
+    # Gradients within the chunk, from position s to position t.
     weight = tl.load(scores + square_at(batch, chunk, chunks, CHUNK))
     weight *= decay_between(row, positions, CHUNK)
     grad_input += product(tl.trans(weight), out, DOT, PRECISION)
@@ -163,11 +163,11 @@ def projection_gradients(
 ):
     """Write BLOCK columns of the gradient of B or C, [B, L, N], for a chunk's tokens.
 
-    The sum over the heads is in their order.
+    The heads are summed in their order.
 
     Args:
-        values, projections, states: with OF_B, x, C and the gradients of the states after the
-            chunks; else grad_output, B and the states before them.
+        values, projections, states: for B (OF_B), x, C and the gradients of the states after each
+            chunk; for C, grad_output, B and the states before each chunk.
         decays: see `sum_decays`.
         grad_scores: see `score_gradients`.
     """

@@ -1,15 +1,15 @@
-"""The indices of a chunk's tokens in the arrays, their decays, and products."""
+"""The places of a chunk's tokens in the arrays, the decays between them, and matrix products."""
 
 import triton.language as tl
 
 from asysplat.kernels.triton_utils import INTERPRETED, kernel, tokens_at
 
 IN_INTERPRETER = tl.constexpr(INTERPRETED)
-# The rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start, with the token's own
-# (<= 0), and its rounding error in float32; log decay to the chunk's end; dt.
+# Rows of the decays, fp32 [B, H, ROWS, positions]: the log decay (<= 0) from the chunk's start,
+# including the token's own; its rounding error in float32; the log decay to the chunk's end; dt.
 SINCE, REST, TO_END, STEP = (tl.constexpr(row) for row in range(4))
 ROWS = tl.constexpr(4)
-# Its exp is 0 in float32; a larger step would make later sums less precise.
+# Least log decay of a token: its exp is 0 in float32, and sums with lesser ones are less precise.
 MIN_EXPONENT = tl.constexpr(-128.0)
 
 
@@ -31,9 +31,9 @@ def rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK):
 
 @kernel
 def state_at(part, first, HEAD_DIM, STATE, BLOCK):
-    """Return the places [P, BLOCK] of the state `part` in [B, chunks, H, P, N].
+    """Return the places of BLOCK columns of a state, [P, BLOCK], in [B, chunks, H, P, N].
 
-    `part` counts all [B, chunks, H].
+    `part` is the state's index in [B, chunks, H].
     """
     row = part * HEAD_DIM + tl.arange(0, HEAD_DIM)
     return row[:, None] * STATE + first + tl.arange(0, BLOCK)[None, :]
@@ -41,7 +41,7 @@ def state_at(part, first, HEAD_DIM, STATE, BLOCK):
 
 @kernel
 def square_at(batch, chunk, chunks, CHUNK):
-    """Return the places of a chunk's square in [B, chunks, CHUNK, CHUNK]."""
+    """Return the places of a chunk's matrix in [B, chunks, CHUNK, CHUNK]."""
     lane = tl.arange(0, CHUNK)
     return ((batch * chunks + chunk) * CHUNK + lane)[:, None] * CHUNK + lane[None, :]
 
@@ -57,11 +57,11 @@ def sum_decays(
     CHUNK: tl.constexpr,
     HEADS: tl.constexpr,
 ):
-    """Write `decays` for a chunk and HEADS heads; a position without a token has dt = 0.
+    """Write the decays for a chunk and HEADS heads; a position without a token has dt = 0.
 
     Args:
         dt, A: [B, L, H] and [H].
-        decays: [B, H, ROWS, positions].
+        decays: [B, H, ROWS, positions], written.
     """
     chunk = tl.program_id(0)
     head = tl.program_id(1) * HEADS + tl.arange(0, HEADS)
@@ -95,7 +95,7 @@ def locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr
 
 @kernel
 def decay_between(row, positions, CHUNK: tl.constexpr):
-    """Return [t, s] the decay from position s to position t >= s; 0 where s is later than t."""
+    """Return [t, s], the decay from position s to position t; 0 where s is later than t."""
     lane = tl.arange(0, CHUNK)
     since = tl.load(row + SINCE * positions + lane)
     rest = tl.load(row + REST * positions + lane)
@@ -106,8 +106,8 @@ def decay_between(row, positions, CHUNK: tl.constexpr):
 
 @kernel
 def product(a, b, DOT: tl.constexpr, PRECISION: tl.constexpr):
-    """Return a @ b, the factors converted to DOT, summed in fp32."""
+    """Return the matrix product a b, with the factors converted to DOT and sums in fp32."""
     a, b = a.to(DOT), b.to(DOT)
-    if IN_INTERPRETER:  # whose products read bfloat16 as integers
+    if IN_INTERPRETER:  # the interpreter's products read bfloat16 as integers
         a, b = a.to(tl.float32), b.to(tl.float32)
     return tl.dot(a, b, input_precision=PRECISION)

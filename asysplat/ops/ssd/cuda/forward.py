@@ -35,7 +35,7 @@ def pass_states(
     DOT: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """Pass BLOCK columns of a head's state from chunk to chunk; with GRADIENT, from the last.
+    """Pass BLOCK columns of a head's state from chunk to chunk; with GRADIENT, from last to first.
 
     Args:
         values, projections: x [B, L, H, P] and B [B, L, N]; with GRADIENT, grad_output and C.
@@ -116,7 +116,7 @@ def forward_chunk(
         x, C, D: see `asysplat.ops.ssd`.
         decays: see `sum_decays`.
         scores: see `score_chunk`.
-        states: [B, chunks, H, P, N] before each chunk.
+        states: [B, chunks, H, P, N] states before each chunk.
     """
     chunk, head = tl.program_id(0) // heads, tl.program_id(0) % heads
     batch = tl.program_id(1).to(tl.int64)

@@ -1,4 +1,4 @@
-"""Both passes: the arrays and launches of the kernels."""
+"""Both passes: the kernels' arrays and launches."""
 
 from typing import Any, NamedTuple
 
@@ -14,19 +14,20 @@ from asysplat.ops.ssd.cuda.backward import head_gradients, projection_gradients,
 from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
 
-TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
+# Tokens of a chunk: few in the slow interpreter, so that short sequences have several chunks.
+TOKENS = 16 if INTERPRETED else CHUNK
 BLOCK = 64  # columns of a state in a program
-HEADS = 8  # heads in a program that sums decays
+HEADS = 8  # heads in a program of `sum_decays`
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}
-# The type of a product's factors, and its precision; fp16 lacks the range of a state.
+# Types of a product's factors, and its precisions. fp16 lacks the range of a state.
 BFLOAT16 = {"DOT": tl.bfloat16, "PRECISION": "ieee"}
 EXACT = {"DOT": tl.float32, "PRECISION": "ieee"}
-# Three products of TF32 are as precise, and several times as fast. Hopper reads their factors from
-# shared memory; elsewhere registers would not hold them. Of smaller factors, Triton 3.6 reads past
-# the end.
+# A sum of three TF32 products is as precise as EXACT and several times as fast. It is used only on
+# Hopper, which reads the factors from shared memory: elsewhere they do not fit into registers. And
+# only for factors of at least this size: of smaller ones, Triton 3.6 reads past the end.
 EXACT_BY_TF32 = {"DOT": tl.float32, "PRECISION": "tf32x3"}
-HOPPER = (9, 0)
-TF32_HEAD_DIM, TF32_STATE = 64, 64  # the head_dim, and the smallest state size
+HOPPER = (9, 0)  # compute capability
+TF32_HEAD_DIM, TF32_STATE = 64, 64  # head_dim, and smallest state size
 
 
 def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple[int]:
@@ -41,10 +42,10 @@ def forward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_products(x, B))
-        decays = _decays(sizes, dt, A)
-        scores = _scores(sizes, B, C)
-        states = _states(sizes, x, B, decays, gradient=False)
+        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_choose_products(x, B))
+        decays = _compute_decays(sizes, dt, A)
+        scores = _compute_scores(sizes, B, C)
+        states = _compute_states(sizes, x, B, decays, gradient=False)
         forward_chunk[(sizes.chunks * sizes.heads, sizes.batch)](
             x, C, D, decays, scores, states, y, **sizes.launch_kwargs(forward_chunk)
         )
@@ -61,7 +62,7 @@ def backward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_products(x, B))
+        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_choose_products(x, B))
         parts = (sizes.batch, sizes.chunks, sizes.heads)
         grads = ScanInputs(
             x=torch.empty_like(x),
@@ -71,9 +72,9 @@ def backward(
             C=torch.empty_like(C),
             D=dt.new_empty(parts),
         )
-        decays, scores = _decays(sizes, dt, A), _scores(sizes, B, C)
-        states = _states(sizes, x, B, decays, gradient=False)
-        grad_states = _states(sizes, grad_output, C, decays, gradient=True)
+        decays, scores = _compute_decays(sizes, dt, A), _compute_scores(sizes, B, C)
+        states = _compute_states(sizes, x, B, decays, gradient=False)
+        grad_states = _compute_states(sizes, grad_output, C, decays, gradient=True)
         head_gradients[(sizes.chunks * sizes.heads, sizes.batch)](
             *(grad_output, x, A, B, C, D),
             decays=decays,
@@ -90,15 +91,15 @@ def backward(
         score_gradients[(sizes.chunks, sizes.batch)](
             grad_output, x, decays, grad_scores, **sizes.launch_kwargs(score_gradients)
         )
-        gradients_of = projection_gradients[(sizes.blocks, sizes.chunks, sizes.batch)]
+        launch = projection_gradients[(sizes.blocks, sizes.chunks, sizes.batch)]
         options = sizes.launch_kwargs(projection_gradients)
-        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **options)
-        gradients_of(grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **options)
+        launch(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **options)
+        launch(grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **options)
     return grads._replace(A=grads.A.sum((0, 1)), D=grads.D.sum((0, 1)))
 
 
 class _Sizes(NamedTuple):
-    """The sizes of a scan."""
+    """The sizes of a scan, its direction, and the options of its products."""
 
     batch: int
     length: int
@@ -107,7 +108,7 @@ class _Sizes(NamedTuple):
     state: int
     reverse: bool
     tokens: int  # tokens of a chunk
-    products: dict[str, Any]  # the type of a product's factors, and its precision
+    products: dict[str, Any]  # type of a product's factors, and its precision
 
     @property
     def chunks(self) -> int:
@@ -122,7 +123,7 @@ class _Sizes(NamedTuple):
         return self.state // self.block
 
     def launch_kwargs(self, kernel: Any) -> dict[str, Any]:
-        """Return a launch's keyword arguments: the sizes that the kernel takes, and options."""
+        """Return the keyword arguments of a launch: what the kernel takes of these, and LAUNCH."""
         sizes = {
             "length": self.length,
             "heads": self.heads,
@@ -137,18 +138,18 @@ class _Sizes(NamedTuple):
         return {name: size for name, size in sizes.items() if name in kernel.arg_names} | LAUNCH
 
 
-def _products(x: Tensor, B: Tensor) -> tuple[int, dict[str, Any]]:
-    """Return the tokens of a chunk, and the type and precision of products."""
+def _choose_products(x: Tensor, B: Tensor) -> tuple[int, dict[str, Any]]:
+    """Return the tokens of a chunk, and the type and precision of its products."""
     if x.dtype == torch.bfloat16:
         return TOKENS, BFLOAT16
     sizes_fit = x.shape[-1] == TF32_HEAD_DIM and B.shape[-1] >= TF32_STATE
     if x.is_cuda and torch.cuda.get_device_capability(x.device) == HOPPER and sizes_fit:
         return TOKENS, EXACT_BY_TF32
-    # Those of whole chunks would not fit into registers.
+    # Exact products of chunks of TOKENS would not fit into registers.
     return max(16, TOKENS // 2), EXACT
 
 
-def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
+def _compute_decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
     """Run `sum_decays`."""
     positions = sizes.chunks * sizes.tokens
     decays = dt.new_empty(sizes.batch, sizes.heads, ROWS.value, positions)
@@ -162,7 +163,7 @@ def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows pos
     return decays
 
 
-def _states(
+def _compute_states(
     sizes: _Sizes, values: Tensor, projections: Tensor, decays: Tensor, gradient: bool
 ) -> Float[Tensor, "B chunks H P N"]:
     """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
@@ -170,14 +171,14 @@ def _states(
     states = decays.new_empty(shape)
     options = sizes.launch_kwargs(pass_states)
     if options["DOT"] == tl.float32:
-        options |= EXACT  # its one product waits for the chunk before: there TF32 is slower
+        options |= EXACT  # TF32 is slower for a single product that waits for the chunk before
     pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
         values, projections, decays, states, GRADIENT=gradient, **options
     )
     return states
 
 
-def _scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
+def _compute_scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
     """Run `score_chunk`."""
     shape = (sizes.batch, sizes.chunks, sizes.tokens, sizes.tokens)
     scores = torch.empty(shape, dtype=torch.float32, device=B.device)
