@@ -1,4 +1,4 @@
-"""The plane sweep's kernels in torch, for any device and float type."""
+"""The operators of the plane sweep in torch, for any device and float type."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -9,29 +9,34 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 WINDOW = 5  # pixels along a side of the compared patches
-BEST = 2  # neighbors that count at each plane: in the others the point may be occluded
-UNMATCHED = 0.8  # greatest cost, that of unrelated patches or of a point that no neighbor sees
-SECOND = 0.15  # greatest cost of the second best neighbor over the best: it may not see the point
-NOISE = 3e-4  # variance of a patch without texture
+BEST = 2  # number of neighbors that count at each plane: others may not see the point
+UNMATCHED = 0.8  # greatest cost, for unrelated patches and for points that no neighbor sees
+SECOND = 0.15  # greatest excess of the second best neighbor's cost, as it may not see the point
+NOISE = 3e-4  # variance of noise, added to each patch's: without texture, patches do not correlate
 SMALL_STEP = 0.1  # SGM's penalty for one plane more or less than the pixel before
 LARGE_STEP = 1.0  # SGM's penalty for more than one plane, where the color does not change
 EDGE = 0.05  # color difference to the pixel before that halves LARGE_STEP
 MIN_WEIGHT = 0.05  # smallest weight of a pixel's own costs in SGM
-MIN_BEND = 1e-9  # curvature of a parabola that has a minimum
+MIN_BEND = 1e-9  # smallest curvature of a parabola whose minimum is computed
 TOLERANCE = 0.01  # relative difference up to which two inverse depths agree
 PIXELS_AT_ONCE = 2**20  # pixels whose consistency is checked at a time
-FRONT = 1e-6  # smallest depth in front of a camera, over the depth in the other
+FRONT = 1e-6  # smallest depth in another view that is in front of it, over the depth in this view
 
 
 class BestPlane(NamedTuple):
-    """The plane of least cost at each pixel, a fraction, and how far its cost is below the mean."""
+    """The plane of least cost at each pixel.
+
+    Args:
+        plane: index of the plane, with a fraction.
+        contrast: mean cost over all planes minus the least cost.
+    """
 
     plane: Float[Tensor, "B V h w"]
     contrast: Float[Tensor, "B V h w"]
 
 
 class Consistency(NamedTuple):
-    """How many other views confirm or contradict a depth; each counts as much as it is trusted.
+    """The numbers of other views that confirm or contradict a depth, each weighted by its trust.
 
     Args:
         agreeing: views with the same depth at the pixel's point.
@@ -53,17 +58,26 @@ def cost_volume(
     ranges: Float[Tensor, "B V 2"],
     planes: int,
 ) -> Float[Tensor, "B V H W D"]:
-    """Compute the matching cost of each pixel with its neighbors at every plane, in [0, UNMATCHED].
+    """Compute the cost of matching each pixel with neighboring views at every plane.
 
-    1 - the zero-mean normalized cross-correlation of patches, which is independent of exposure; the
-    mean of the best two neighbors whose images contain the point. The second's is at most the
-    best's + SECOND, so that a neighbor that does not see a plane hardly counts against it.
+    A neighbor's cost is 1 - the zero-mean normalized cross-correlation of patches, which does not
+    depend on exposure. The result, in [0, UNMATCHED], is the mean over the two best neighbors whose
+    images contain the point. The second best's cost counts as at most SECOND above the best's, so
+    that a neighbor that does not see the point hardly counts.
+
+    Args:
+        images: gray images.
+        neighbors: indices of neighboring views in the same scene; -1 for none.
+        projections: matrices into the neighbors; see `matrices` in
+            asysplat/models/prior/projections.py.
+        ranges: inverse depths of the first and of the last plane.
+        planes: number of planes, at least 2, at equal steps of inverse depth.
     """
     B, V, H, W = images.shape
-    # An image's small variances would be lost beside large squares.
+    # The mean's square would hide the small variances of an image.
     images = images - images.mean((-2, -1), keepdim=True)
     costs = images.new_empty(B, V, H, W, planes)
-    pixels = _pixels(H, W, images)
+    pixels = _pixel_centers(H, W, images)
     for b in range(B):
         for v in range(V):
             first, last = ranges[b, v]
@@ -92,7 +106,7 @@ def _compare(
     pixels: Float[Tensor, "3 H W"],
     inverse: Float[Tensor, "D"],
 ) -> Float[Tensor, "D H W"]:
-    """Return the cost of one neighbor at every plane; infinite outside its image."""
+    """Return the cost of one neighbor at every plane; infinite for points outside its image."""
     H, W = image.shape
     flat = torch.einsum("ij,jyx->iyx", matrix[:, :3], pixels)
     points = flat + inverse[:, None, None, None] * matrix[:, 3, None, None]
@@ -113,7 +127,7 @@ def _compare(
 
 
 def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:
-    """Return the mean over WINDOW x WINDOW pixels; the border's pixels continue beyond it."""
+    """Return the mean of the patch around each pixel; an image's border is repeated beyond it."""
     H, W = values.shape[-2:]
     padded = F.pad(values.reshape(-1, 1, H, W), (WINDOW // 2,) * 4, mode="replicate")
     rows = reduce(torch.add, (padded[..., k : k + H, :] for k in range(WINDOW)))
@@ -128,26 +142,27 @@ def sgm(
 ) -> BestPlane:
     """Aggregate the costs along rows and columns, both ways, and find the plane of least cost.
 
-    A step between neighboring pixels costs less where the color changes.
+    A change of plane between adjacent pixels costs less where the color changes.
 
     Args:
+        costs: matching costs of D planes.
         weights: weights of the pixels' costs, in [0, 1].
-        edges: color differences to the left pixel, and to the pixel above.
+        edges: color differences to the pixel on the left, and to the pixel above.
     """
     costs = costs * weights[..., None].clamp_min(MIN_WEIGHT)
     penalty = LARGE_STEP / (1 + edges / EDGE)
     left, above = penalty[:, :, 0], penalty[:, :, 1]
     total = (
-        _along(costs, left, 3)
-        + _along(costs.flip(3), left.roll(-1, 3).flip(3), 3).flip(3)
-        + _along(costs, above, 2)
-        + _along(costs.flip(2), above.roll(-1, 2).flip(2), 2).flip(2)
+        _aggregate(costs, left, 3)
+        + _aggregate(costs.flip(3), left.roll(-1, 3).flip(3), 3).flip(3)
+        + _aggregate(costs, above, 2)
+        + _aggregate(costs.flip(2), above.roll(-1, 2).flip(2), 2).flip(2)
     )
-    return lowest_plane(total)
+    return find_best_plane(total)
 
 
-def lowest_plane(total: Float[Tensor, "B V h w D"]) -> BestPlane:
-    """Find the plane of least cost, refined by the parabola through three planes."""
+def find_best_plane(total: Float[Tensor, "B V h w D"]) -> BestPlane:
+    """Find the plane of least cost, refined by the parabola through it and the adjacent planes."""
     planes = total.shape[-1]
     best = total.argmin(-1, keepdim=True)
     middle = total.gather(-1, best)
@@ -160,10 +175,10 @@ def lowest_plane(total: Float[Tensor, "B V h w D"]) -> BestPlane:
     return BestPlane((best + shift.clamp(-0.5, 0.5))[..., 0], contrast)
 
 
-def _along(
+def _aggregate(
     costs: Float[Tensor, "B V h w D"], penalty: Float[Tensor, "B V h w"], dim: int
 ) -> Float[Tensor, "B V h w D"]:
-    """Return the path costs of each pixel (Hirschmueller 2008, Eq. 13)."""
+    """Return the costs of the paths along `dim` to each pixel (Hirschmueller 2008, Eq. 13)."""
     pixels, penalties = costs.unbind(dim), penalty.unbind(dim)
     paths = [pixels[0]]
     far = pixels[0].new_full((*pixels[0].shape[:-1], 1), torch.inf)
@@ -191,16 +206,17 @@ def consistency(
 
     Args:
         inverse: inverse depths.
-        steps: between the inverse depths that a view can distinguish.
-        trust: in a view's depths, in [0, 1].
-        others: the views to compare with; -1 for none.
-        projections: into those; see `matrices` in asysplat/models/prior/projections.py.
-        tolerance: relative difference up to which two inverse depths agree; half a step if that is
-            more.
+        steps: smallest difference of inverse depths that each view can distinguish.
+        trust: weight of each depth, in [0, 1].
+        others: indices of the views to compare with, in the same scene; -1 for none.
+        projections: matrices into these views; see `matrices` in
+            asysplat/models/prior/projections.py.
+        tolerance: relative difference up to which two inverse depths agree. They also agree up to
+            half a step.
     """
     B, _, h, w = inverse.shape
     scene = torch.arange(B, device=others.device)[:, None, None]
-    pixels = _pixels(h, w, inverse)
+    pixels = _pixel_centers(h, w, inverse)
 
     def count(others: Tensor, projections: Tensor) -> Consistency:
         view = others.clamp_min(0)
@@ -215,9 +231,9 @@ def consistency(
         place = (scene[..., None, None], view[..., None, None], row, column)
         nearer = inverse[:, :, None] / front - inverse[place]
         half_step = steps[scene, view][..., None, None] / 2
-        apart = torch.maximum(half_step, tolerance * inverse[place])
-        agree = inside & (nearer.abs() <= apart)
-        contradict, occlude = inside & (nearer > apart), inside & (nearer < -apart)
+        limit = torch.maximum(half_step, tolerance * inverse[place])
+        agree = inside & (nearer.abs() <= limit)
+        contradict, occlude = inside & (nearer > limit), inside & (nearer < -limit)
         weight = trust[place]
         counts = (agree * weight, contradict * weight, occlude * weight, inside.to(weight))
         return Consistency(*(values.sum(2) for values in counts))
@@ -228,8 +244,8 @@ def consistency(
     return Consistency(*(torch.stack(counts).sum(0) for counts in zip(*parts, strict=True)))
 
 
-def _pixels(height: int, width: int, like: Tensor) -> Float[Tensor, "3 H W"]:
-    """Return x, y and 1 of each pixel's center."""
+def _pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "3 H W"]:
+    """Return each pixel center's homogeneous coordinates x, y and 1."""
     y, x = torch.meshgrid(
         torch.arange(height, device=like.device) + 0.5,
         torch.arange(width, device=like.device) + 0.5,

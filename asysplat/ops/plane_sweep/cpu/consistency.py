@@ -26,12 +26,12 @@ HALF, FRONT = np.float32(0.5), np.float32(reference.FRONT)
 
 
 class ConsistencyInputs(NamedTuple):
-    """NumPy arrays; n counts the views of all scenes.
+    """NumPy arrays for the n views of all scenes; see `reference.consistency`.
 
     Args:
         maps: [n, h, w, 2], inverse depths and the trust in them.
         steps: [n].
-        others: [n, K], counted from a scene's first view; -1 for none.
+        others: [n, K].
         projections: [n, K, 3, 4].
         tolerance: relative difference up to which two inverse depths agree.
     """

@@ -1,8 +1,8 @@
 """The cost volume on CPUs: a task takes a vector of planes through a view, two rows at a time.
 
-It warps the rows of each neighbor one by one, where the neighbor's image may contain the points,
-and keeps the rows that two rows of patches need; it sums over patches along columns first, then
-along the row.
+It warps each neighbor to the view row by row, only where the neighbor's image may contain the
+points, and keeps the warped rows that two rows of patches need. It sums a patch along its columns
+first, then along the row.
 """
 
 import numpy as np
@@ -28,13 +28,13 @@ from asysplat.kernels.simd.vectors import (
     zeros,
 )
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
+from asysplat.ops.plane_sweep.inputs import CostInputs, prepare_inputs
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 
-assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
-AROUND = WINDOW // 2
+assert BEST == 2 and WINDOW == 5  # the kernel keeps two costs, and sums five columns
+RADIUS = WINDOW // 2
 COUNT = np.float32(WINDOW**2)  # pixels of a patch
-NOISE = np.float32(reference.NOISE * WINDOW**4)  # in the variance of sums
+NOISE = np.float32(reference.NOISE * WINDOW**4)  # COUNT^2 times the noise; see `_variance`
 BUFFER = WINDOW + 1  # rows that two rows of patches need
 HALF = np.float32(0.5)
 FRONT = np.float32(reference.FRONT)
@@ -51,7 +51,7 @@ def cost_volume(
 ) -> Float[Tensor, "B V H W D"]:
     """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
-    inputs = prepare(images, neighbors, projections, ranges, planes)
+    inputs = prepare_inputs(images, neighbors, projections, ranges, planes)
     costs = torch.empty(B * V, H, W, planes)
     run_blocks(
         cost_planes,
@@ -68,19 +68,19 @@ def cost_planes(start, stop, inputs, costs):
 
     Args:
         inputs: see `CostInputs`.
-        costs: [n, H, W, D].
+        costs: [n, H, W, D], written.
     """
     H, W = inputs.images.shape[1:]
     planes = costs.shape[-1]
     K = inputs.neighbors.shape[1]
     vectors = inputs.inverse.shape[1] // LANES
-    # A place for each of the last rows of each neighbor.
+    # The last rows of each neighbor: row y is at y % BUFFER.
     warped = np.empty((K, BUFFER, W, LANES), np.float32)
     visible = np.empty((K, BUFFER, W), np.uint16)
     spans = np.empty((K, H, 2), np.int64)
-    # The least cost of each pixel of two rows, and the one after.
+    # The least and the second least cost of each pixel of two rows.
     first, second = np.empty((2, W, LANES), np.float32), np.empty((2, W, LANES), np.float32)
-    # Offsets and scales of the patches in these rows.
+    # What `_describe_row` computes for the patches in these rows.
     offsets, scales = np.empty((2, W), np.float32), np.empty((2, W), np.float32)
     along = np.empty((2, W + WINDOW - 1), np.float32)
     for block in range(start, stop):
@@ -102,14 +102,14 @@ def cost_planes(start, stop, inputs, costs):
                     continue
                 neighbor = inputs.padded[inputs.neighbors[view, k]]
                 matrix = inputs.projections[view, k]
-                for row in range(0 if y == 0 else y + AROUND, min(y + AROUND + 2, H)):
+                for row in range(0 if y == 0 else y + RADIUS, min(y + RADIUS + 2, H)):
                     begin, end = W, 0  # the columns of this row that patches need
-                    for near in range(max(row - AROUND, 0), min(row + AROUND + 1, H)):
+                    for near in range(max(row - RADIUS, 0), min(row + RADIUS + 1, H)):
                         begin, end = min(begin, spans[k, near, 0]), max(end, spans[k, near, 1])
-                    columns = range(max(begin - AROUND, 0), min(end + AROUND, W))
-                    place = row % BUFFER
+                    columns = range(max(begin - RADIUS, 0), min(end + RADIUS, W))
+                    slot = row % BUFFER
                     _warp_row(
-                        warped[k, place], visible[k, place], neighbor, matrix, row, depth, columns
+                        warped[k, slot], visible[k, slot], neighbor, matrix, row, depth, columns
                     )
                 patches = (image, offsets, scales)
                 _compare_rows(first, second, patches, y, warped[k], visible[k], spans[k])
@@ -124,9 +124,9 @@ def cost_planes(start, stop, inputs, costs):
 
 @inline
 def _find_span(span, matrix, y, depth, H, W):
-    """Write the range of columns of row y inside a neighbor's image at any of the planes.
+    """Write the range of the columns of row y that are inside a neighbor's image at any plane.
 
-    The image has a margin of a pixel, so that rounding excludes none.
+    The image gets a margin of one pixel, so that rounding excludes no column.
     """
     low, high = ZERO + zeros(), np.float32(W) + zeros()
     for side in range(4):
@@ -151,7 +151,7 @@ def _find_span(span, matrix, y, depth, H, W):
 
 @inline
 def _warp_row(warped, visible, neighbor, matrix, y, depth, columns):
-    """Write a neighbor's warped pixels of a row, [W, LANES], and which are inside its image."""
+    """Write a neighbor's pixels warped to a row, [W, LANES], and masks of those in its image."""
     bottom, right = np.float32(neighbor.shape[0] - 1), np.float32(neighbor.shape[1] - 1)
     row = np.float32(y) + HALF
     x_row = fma(depth, matrix[0, 3], fma(matrix[0, 1], row, matrix[0, 2]))
@@ -174,28 +174,29 @@ def _warp_row(warped, visible, neighbor, matrix, y, depth, columns):
 
 @inline
 def _compare_rows(first, second, patches, y, warped, visible, spans):
-    """Merge a neighbor's costs into the two least of each pixel of the rows y and y + 1.
+    """Merge a neighbor's costs into the two least of each pixel in the rows y and y + 1.
 
-    Both rows' patches share four rows. Below the last row, y replaces y + 1.
+    The patches of the two rows share four rows. If y is the last row, it replaces y + 1.
     """
     image, offsets, scales = patches
     H, W = image.shape
     below = min(y + 1, H - 1)
     begin = min(spans[y, 0], spans[below, 0])
     end = max(begin, spans[y, 1], spans[below, 1])
-    top, bottom = max(y - AROUND, 0), min(y + AROUND + 1, H - 1)
-    # Sums along the last columns: of the neighbor, its square, its product with the view.
+    top, bottom = max(y - RADIUS, 0), min(y + RADIUS + 1, H - 1)
+    # Sums over the last columns of the upper patches (a, b, c) and of the lower ones (d, e, f): of
+    # the neighbor, of its square, and of its product with the view; see `_advance`.
     nothing = (zeros(), zeros(), zeros(), zeros())
     a, b, c, d, e, f = nothing, nothing, nothing, nothing, nothing, nothing
-    for right in range(begin - AROUND, end + AROUND):
-        column = min(max(right, 0), W - 1)  # the border's pixels continue beyond it
+    for right in range(begin - RADIUS, end + RADIUS):
+        column = min(max(right, 0), W - 1)  # the border is repeated beyond the image
         common = (zeros(), zeros(), zeros())
         for k in range(1, WINDOW):
-            row = min(max(y - AROUND + k, 0), H - 1)
+            row = min(max(y - RADIUS + k, 0), H - 1)
             common = _add(common, load(warped[row % BUFFER], column), image[row, column])
         upper = _add(common, load(warped[top % BUFFER], column), image[top, column])
         lower = _add(common, load(warped[bottom % BUFFER], column), image[bottom, column])
-        x = right - AROUND
+        x = right - RADIUS
         if x >= begin:
             sums = (_sum(a, upper[0]), _sum(b, upper[1]), _sum(c, upper[2]))
             cost = where(visible[y % BUFFER, x], _cost(sums, offsets[0, x], scales[0, x]), INFINITY)
@@ -209,25 +210,25 @@ def _compare_rows(first, second, patches, y, warped, visible, spans):
 
 @inline
 def _add(sums, value, pixel):
-    """Add a neighbor's values to the three sums."""
+    """Add a neighbor's values to the sums of values, squares and products."""
     return sums[0] + value, fma(value, value, sums[1]), fma(value, pixel, sums[2])
 
 
 @inline
 def _advance(last, new):
-    """Return the last column, and the sums of the last two columns and of earlier pairs."""
+    """Return the new column, and the sums of the pairs that end 0, 1 and 2 columns before it."""
     return new, last[0] + new, last[1], last[2]
 
 
 @inline
 def _sum(last, new):
-    """Return the sum of five columns."""
+    """Return the sum of the new column and the four before it; for `last` see `_advance`."""
     return last[3] + last[1] + new
 
 
 @inline
 def _cost(sums, offset, scale):
-    """Return 1 - the correlation, from the sums over a patch; see `_describe_row`."""
+    """Return 1 - the correlation of a patch from its `sums`; for the others see `_describe_row`."""
     total, square, both = sums
     return fma(fma(total, offset, both * -scale), rsqrt(_variance(total, square)), ONE)
 
@@ -242,23 +243,23 @@ def _merge(first, second, x, cost):
 
 @inline
 def _describe_row(offsets, scales, image, y, sums):
-    """Write the sum over each patch of row y, and COUNT, both over the deviation of such sums.
+    """Write each patch's sum, and COUNT, both divided by the root of the patch's `_variance`.
 
-    `sums` [2, W + WINDOW - 1] is scratch: sums along columns, of pixels and of squares.
+    `sums` [2, W + WINDOW - 1] is scratch memory for the sums of pixels and squares along columns.
     """
     H, W = image.shape
     for x in range(0, W, LANES):
         count = min(W - x, LANES)
         total, square = zeros(), zeros()
         for k in range(WINDOW):
-            value = load_some(image[min(max(y - AROUND + k, 0), H - 1)], x, count)
+            value = load_some(image[min(max(y - RADIUS + k, 0), H - 1)], x, count)
             total, square = total + value, fma(value, value, square)
-        store_some(sums[0], AROUND + x, count, total)
-        store_some(sums[1], AROUND + x, count, square)
+        store_some(sums[0], RADIUS + x, count, total)
+        store_some(sums[1], RADIUS + x, count, square)
     for kind in range(2):
-        for k in range(AROUND):  # the border's pixels continue beyond it
-            sums[kind, k] = sums[kind, AROUND]
-            sums[kind, AROUND + W + k] = sums[kind, AROUND + W - 1]
+        for k in range(RADIUS):  # the border is repeated beyond the image
+            sums[kind, k] = sums[kind, RADIUS]
+            sums[kind, RADIUS + W + k] = sums[kind, RADIUS + W - 1]
     for x in range(0, W, LANES):
         count = min(W - x, LANES)
         total, square = zeros(), zeros()
@@ -272,5 +273,5 @@ def _describe_row(offsets, scales, image, y, sums):
 
 @inline
 def _variance(total, square):
-    """Return COUNT^2 variances of patches and their noise, from sums of pixels and of squares."""
+    """Return COUNT^2 times a patch's variance with noise, from its sums of pixels and squares."""
     return max(fma(square, COUNT, ZERO - total * total), ZERO) + NOISE

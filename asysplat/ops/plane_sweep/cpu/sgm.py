@@ -1,4 +1,4 @@
-"""SGM on CPUs: a task takes a view, and its paths one direction after the other."""
+"""SGM on CPUs: a task takes a view, one direction of its paths after the other."""
 
 import numpy as np
 import torch
@@ -45,21 +45,22 @@ def sgm(
 
 @kernel
 def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
-    """Write the planes of the views start to stop, and the contrasts.
+    """Write the planes and contrasts of the views start to stop.
 
     Args:
         costs: [n, h, w, D].
-        weights: [n, h, w], of a pixel's costs.
-        penalties: [n, 2, h, w], of a step of several planes from the left and from above.
-        plane, contrast: [n, h, w].
+        weights: [n, h, w] weights of the pixels' costs.
+        penalties: [n, 2, h, w] penalties for a step of several planes, from the pixel on the left
+            and from the pixel above.
+        plane, contrast: [n, h, w], written; see `reference.BestPlane`.
     """
     h, w, planes = costs.shape[1:]
     vectors = -(-planes // LANES)
     weighted = np.empty((h, w, vectors * LANES), np.float32)
     sums = np.empty((h, w, vectors * LANES), np.float32)
-    # Costs of the paths to the last two pixels of each line, infinite beyond the planes.
+    # The costs of the paths to the last two pixels of each line, infinite beyond the planes.
     paths = np.full((2, max(h, w), vectors * LANES + 2), INFINITY, np.float32)
-    lows = np.empty(max(h, w), np.float32)  # the least of each path
+    lows = np.empty(max(h, w), np.float32)  # least cost of each path
     numbers = np.arange(vectors * LANES).astype(np.float32)
     for n in range(start, stop):
         for y in range(h):
@@ -74,7 +75,7 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
                     store_some(paths[0, line], 1 + v * LANES, LANES, zeros())
             for k in range(length):
                 position = length - 1 - k if back else k
-                entry = min(position + back, length - 1)  # whose penalty applies to this step
+                entry = min(position + back, length - 1)  # position of this step's penalty
                 for line in range(lines):
                     y, x = (line, position) if along else (position, line)
                     penalty = penalties[n, 0, y, entry] if along else penalties[n, 1, entry, x]
@@ -84,7 +85,7 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
                     )
         for y in range(h):
             for x in range(w):
-                plane[n, y, x], contrast[n, y, x] = _find_lowest(sums[y, x], numbers, planes)
+                plane[n, y, x], contrast[n, y, x] = _find_best_plane(sums[y, x], numbers, planes)
 
 
 @inline
@@ -99,10 +100,13 @@ def _begin(weighted, sums, costs, weight):
 
 @inline
 def _extend(old, new, low, far, cost, sums):
-    """Extend the paths by a pixel; write their costs, add them to `sums`, and return the least.
+    """Extend the paths by a pixel: write their costs, add them to `sums`, and return the least.
 
-    `old` and `new` have an element more at both ends; `far` is `low`, the least of `old`, and the
-    penalty for several planes more or less.
+    Args:
+        old, new: costs of the paths before and after, with one more element at each end.
+        low: least cost in `old`.
+        far: sum of `low` and the penalty for a step of several planes.
+        cost: costs of the pixel.
     """
     lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):
@@ -116,15 +120,12 @@ def _extend(old, new, low, far, cost, sums):
 
 
 @inline
-def _find_lowest(costs, numbers, planes):
-    """Return the plane of the lowest cost, and how far the cost is below the mean.
-
-    The plane is refined by the parabola through three.
-    """
-    lowest, everything = INFINITY + zeros(), zeros()
+def _find_best_plane(costs, numbers, planes):
+    """Return the plane of least cost, and the contrast; see `reference.find_best_plane`."""
+    lowest, sums = INFINITY + zeros(), zeros()
     for d in range(0, planes, LANES):
         lowest = min(lowest, load_some(costs, d, LANES))
-        everything = everything + load_some(costs, d, min(planes - d, LANES))
+        sums = sums + load_some(costs, d, min(planes - d, LANES))
     low = least(lowest)
     first = INFINITY + zeros()
     for d in range(0, planes, LANES):
@@ -139,4 +140,4 @@ def _find_lowest(costs, numbers, planes):
         bend = before + after - 2 * costs[best]
         if bend > MIN_BEND:
             shift = min(max((before - after) / (2 * bend), -HALF), HALF)
-    return best + shift, total(everything) / planes - low
+    return best + shift, total(sums) / planes - low

@@ -61,8 +61,9 @@ def count_views(
     """Write the counts of PIXELS pixels of a view; see `reference.Consistency`.
 
     Args:
-        inverse, steps, trust, others, projections: see `reference.consistency`.
-        views, neighbors: number of views of a scene, and of other views of each.
+        inverse, steps, trust, others, projections, tolerance: see `reference.consistency`.
+        views: number of views of a scene.
+        neighbors: number of views in `others` for each view.
     """
     view = tl.program_id(1).to(tl.int64)
     first = view // views * views

@@ -1,6 +1,6 @@
 """The cost volume on GPUs: a program takes some columns and planes down a band of a view's rows.
 
-The sums along a patch's last rows stay in registers, for every neighbor.
+For every neighbor, the sums along the last rows of the patches stay in registers.
 """
 
 import torch
@@ -11,15 +11,15 @@ from torch import Tensor
 
 from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.inputs import prepare
+from asysplat.ops.plane_sweep.inputs import prepare_inputs
 
-AROUND = tl.constexpr(reference.WINDOW // 2)
+RADIUS = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
 PIXEL_WEIGHT = tl.constexpr(1 / reference.WINDOW**2)  # weight of a pixel in a patch's mean
 FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
 UNMATCHED, SECOND = tl.constexpr(reference.UNMATCHED), tl.constexpr(reference.SECOND)
 INFINITY = tl.constexpr(float("inf"))
-TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; rows
+TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes, and rows, of a program
 
 
 def cost_volume(
@@ -31,7 +31,7 @@ def cost_volume(
 ) -> Float[Tensor, "B V H W D"]:
     """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
-    inputs = prepare(images, neighbors, projections, ranges, planes)
+    inputs = prepare_inputs(images, neighbors, projections, ranges, planes)
     means = reference.patch_mean(inputs.images)
     variances = (reference.patch_mean(inputs.images**2) - means**2).clamp_min(0)
     costs = images.new_empty(B * V, H, W, planes)
@@ -80,7 +80,7 @@ def cost_band(
 
     Args:
         images, padded, neighbors, projections, inverse: see `CostInputs`.
-        means, scales: [n, H, W], of patches, and 1 / their standard deviations.
+        means, scales: [n, H, W] means of the patches, and 1 / their standard deviations.
     """
     view = tl.program_id(2).to(tl.int64)
     parts = tl.cdiv(planes, PLANES)
@@ -94,9 +94,9 @@ def cost_band(
     sums = ()
     for _ in tl.static_range(K * EARLIER):
         sums = sums + ((nothing, nothing, nothing),)
-    for step in range(rows + 2 * AROUND):
-        y = begin + step - 2 * AROUND  # all rows of its patch are summed now
-        row = tl.minimum(tl.maximum(y + AROUND, 0), height - 1)
+    for step in range(rows + 2 * RADIUS):
+        y = begin + step - 2 * RADIUS  # the row whose patches this step completes
+        row = tl.minimum(tl.maximum(y + RADIUS, 0), height - 1)
         middle = tl.minimum(tl.maximum(y, 0), height - 1)
         pixel = (view * height + middle) * width + x
         mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
@@ -136,13 +136,13 @@ def cost_band(
 
 @kernel
 def add_row(line, neighbor_image, matrix, x, row, depth, height, width):
-    """Return the sums of a neighbor, its square, and its product with `line` along a patch's row.
+    """Return the sums along a patch's row of a neighbor, its square, and its product with `line`.
 
-    The border's pixels continue beyond it.
+    The border is repeated beyond the image.
     """
     factors = factors_at(matrix, row)
     a, b, c = 0.0, 0.0, 0.0
-    for k in tl.static_range(-AROUND, AROUND + 1):
+    for k in tl.static_range(-RADIUS, RADIUS + 1):
         column = tl.minimum(tl.maximum(x + k, 0), width - 1)
         u, v, _ = project(factors, column, depth)
         u = tl.minimum(tl.maximum(u - 0.5, 0.0), width - 1.0)
@@ -162,9 +162,9 @@ def add_row(line, neighbor_image, matrix, x, row, depth, height, width):
 
 @kernel
 def factors_at(matrix, y):
-    """Return the factors of x, 1 and the inverse depth for the pixels of a row.
+    """Return the factors of x, 1 and the inverse depth in a neighbor's homogeneous coordinates.
 
-    Three numbers for each homogeneous coordinate in a neighbor.
+    They are three numbers for each of the three coordinates, for the pixels of row y.
     """
     y += 0.5
     factors = ()
@@ -177,7 +177,7 @@ def factors_at(matrix, y):
 
 @kernel
 def project(factors, x, depth):
-    """Project pixels into a neighbor: coordinates and depths, [columns, planes]."""
+    """Return the coordinates and relative depths of pixels in a neighbor, [columns, planes]."""
     x = x[:, None] + 0.5
     u = factors[0] * x + factors[1] + factors[2] * depth
     v = factors[3] * x + factors[4] + factors[5] * depth

@@ -26,8 +26,8 @@ def sgm(
     total = torch.zeros_like(costs)
     tile_planes = triton.next_power_of_2(planes)
     directions = (
-        (penalties[:, :, 0], (h, w), (w, 1)),  # along rows, and along columns
-        (penalties[:, :, 1], (w, h), (1, w)),
+        (penalties[:, :, 0], (h, w), (w, 1)),  # along rows
+        (penalties[:, :, 1], (w, h), (1, w)),  # along columns
     )
     with torch.cuda.device_of(costs):
         for penalty, (lines, length), (apart, step) in directions:
@@ -45,7 +45,7 @@ def sgm(
                     PLANES=tile_planes,
                     **FUSED,
                 )
-    return reference.lowest_plane(total)
+    return reference.find_best_plane(total)
 
 
 @kernel
@@ -67,15 +67,16 @@ def add_paths(
 
     Args:
         costs, total: [n, h, w, D].
-        weights: [n, h, w], of a pixel's costs.
-        penalties: [n, h, w], of a step of several planes from the pixel before in a line.
-        apart, step: from one line to the next, and from one pixel to the next, in pixels.
+        weights: [n, h, w] weights of the pixels' costs.
+        penalties: [n, h, w] penalties for a step of several planes, from the pixel on the left or
+            above.
+        apart, step: strides from one line to the next, and from one pixel of a line to the next.
     """
     view = tl.program_id(1).to(tl.int64)
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     plane = tl.broadcast_to(tl.arange(0, PLANES)[None, :], (LINES, PLANES))
     exists = line < lines
-    path = tl.zeros((LINES, PLANES), tl.float32)  # it starts with cost 0 at all planes
+    path = tl.zeros((LINES, PLANES), tl.float32)  # a path starts with cost 0 at all planes
     low = tl.zeros((LINES,), tl.float32)
     for k in range(length):
         position = length - 1 - k if REVERSE else k
@@ -89,7 +90,7 @@ def add_paths(
         cost = tl.load(costs + place, mask=inside, other=0.0) * weight
         nearer = tl.gather(path, tl.minimum(plane + 1, PLANES - 1), 1)
         farther = tl.gather(path, tl.maximum(plane - 1, 0), 1)
-        near = tl.minimum(nearer, farther) + SMALL_STEP  # at both ends the plane itself
+        near = tl.minimum(nearer, farther) + SMALL_STEP  # the end planes are their own neighbors
         path = tl.minimum(tl.minimum(path, near), far[:, None]) - low[:, None]
         path = tl.where(plane < planes, cost + path, INFINITY)
         low = tl.min(path, 1)
