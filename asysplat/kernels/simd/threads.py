@@ -1,4 +1,4 @@
-"""Compilation of CPU kernels, cached on disk, and their runs on as many threads as torch uses."""
+"""Compilation of CPU kernels, cached on disk, and runs on as many threads as torch uses."""
 
 import hashlib
 import inspect
@@ -23,9 +23,9 @@ PER_THREAD = 4  # portions of the work per thread, so that a faster thread can t
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile a kernel for `run_blocks`, which does not hold Python's global lock.
+    """Compile a kernel for `run_blocks` that runs without Python's global lock.
 
-    With NUMBA_BOUNDSCHECK=1 it checks every index.
+    With NUMBA_BOUNDSCHECK=1, the kernel checks every index.
     """
     config = numba.config
     before = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
