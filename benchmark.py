@@ -8,7 +8,9 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
+os.environ.setdefault(
+    "OMP_WAIT_POLICY", "PASSIVE"
+)  # read when torch is imported: waiting threads must not spin
 
 from asysplat.cli import check_command, command
 
@@ -28,7 +30,7 @@ from benchmarks.table import write_results
 
 @command("benchmark")
 def benchmark(options: DictConfig) -> None:
-    """Measure, print the tables, write all; exit with 1 if anything is worse than in `compare`."""
+    """Measure a suite, print and write the results; exit with 1 if any is worse than `compare`."""
     suite = find_suite(options.suite)
     if not isinstance(options.repeats, int) or options.repeats < 1:
         raise InputError(f"repeats={options.repeats} cannot be: give a whole number from 1.")
@@ -44,11 +46,11 @@ def benchmark(options: DictConfig) -> None:
     figure = suite.plot(results) if hasattr(suite, "plot") else None
     for file in write_results(results, tables, figure, path):
         console.print(f"written: {file}", soft_wrap=True)
-    if hasattr(suite, "verdict") and (complaint := suite.verdict(results)):
-        sys.exit(complaint)
+    if hasattr(suite, "verdict") and (message := suite.verdict(results)):
+        sys.exit(message)
     if old is None:
         return
-    comparison = compare(old, results, suite.WATCHED)
+    comparison = compare(old, results, suite.TRACKED)
     for line in comparison.lines():
         console.print(line, soft_wrap=True, markup=False, highlight=False)
     if comparison.worse:

@@ -2,13 +2,13 @@
 
 A suite is a module named in `options.SUITES`. It has
 
-measure(options, console) -> results    plain numbers, words, lists and dictionaries; InputError
-                                        for unknown names and values that cannot be
-tables(results) -> rich tables          made by `table.make_table`
-WATCHED                                 what compare=old.json compares: a `compare.Watched`
+measure(options, console) -> results    a dictionary of what JSON can hold; raises InputError for
+                                        unknown names and impossible values
+tables(results) -> rich tables          each made by `table.make_table`
+TRACKED                                 the `compare.TrackedMetrics` that compare=old.json compares
 
 and may have
 
-plot(results) -> figure                 written as <suite>.png
-verdict(results) -> sentence or None    a failure, printed at the end; the exit status is 1
+plot(results) -> figure                 written to <suite>.png
+verdict(results) -> message or None     a failure; printed at the end, and the exit status is 1
 """

@@ -1,4 +1,4 @@
-"""Small workloads over their baselines: ratios that a change of the code must not raise."""
+"""Small workloads, timed relative to baselines: ratios that a code change must not raise."""
 
 import math
 import time
@@ -19,19 +19,19 @@ from asysplat.ops.image_loss import image_loss
 from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.refinement import Refinement
 from asysplat.scene import Views
-from benchmarks.compare import RATIO, Watched
+from benchmarks.compare import RATIO, TrackedMetrics
 from benchmarks.model import Workload, make_net, make_views
 from benchmarks.ops import make_path
 from benchmarks.options import CPU
-from benchmarks.render import Backend, prepare, run
+from benchmarks.render import Backend, prepare_inputs, run_passes
 from benchmarks.scenes import random_scene
-from benchmarks.table import machine_note, make_table, median_iqr_column, text
-from benchmarks.timing import Measurement, Result, Run, summary, time_in_rounds
+from benchmarks.table import machine_note, make_table, median_iqr_column, text_column
+from benchmarks.timing import Measurement, Result, Run, summarize, time_in_rounds
 
 aten = torch.ops.aten
-BEST_OF = 3  # runs in a round: interruptions only make a run slower
-WATCHED = Watched(names=("workload", "over"), alike=(), kinds={"ratio": RATIO})
-OPERATORS = {  # the backend that is the baseline, and the sizes of the inputs
+BEST_OF = 3  # runs in a round, of which the fastest counts: interruptions only slow a run down
+TRACKED = TrackedMetrics(names=("workload", "baseline_name"), must_match=(), kinds={"ratio": RATIO})
+OPERATORS = {  # baseline backend, and sizes of the inputs
     "ssd": ("chunked", {"batch": 1, "length": 512, "heads": 4, "head_dim": 64, "state": 64}),
     "selective_scan": ("chunked", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
     "plane_sweep": (
@@ -39,7 +39,7 @@ OPERATORS = {  # the backend that is the baseline, and the sizes of the inputs
         {"batch": 1, "views": 4, "height": 32, "width": 32} | {"planes": 48, "neighbors": 3},
     ),
 }
-GAUSSIANS, SIDE = 5000, 96  # numbers of Gaussians, and of pixels a side, in the renderer's scene
+GAUSSIANS, SIDE = 5000, 96  # size of the renderer's scene, and side of its image in pixels
 PRODUCTS = {
     call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.convolution)
 }
@@ -48,22 +48,25 @@ NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
 
 
 class Pair(NamedTuple):
+    """A workload and the baseline that its time is divided by."""
+
     name: str
-    over: str  # what the baseline is
+    baseline_name: str
     workload: Run
     baseline: Run
 
 
 def make_pairs() -> Iterator[Pair]:
-    """Make all pairs; the same numbers at every call."""
-    for name, (over, sizes) in OPERATORS.items():
-        paths = [make_path(name, sizes, backend, torch.float32, CPU) for backend in ("cpu", over)]
-        yield Pair(name, over, *(path.forward_backward for path in paths))
+    """Make all pairs, with the same numbers at every call."""
+    for name, (baseline_name, sizes) in OPERATORS.items():
+        backends = ("cpu", baseline_name)
+        paths = [make_path(name, sizes, backend, torch.float32, CPU) for backend in backends]
+        yield Pair(name, baseline_name, *(path.forward_backward for path in paths))
 
     # Both passes of the renderer, and a step of the refinement
     gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
-    inputs = prepare((gaussians, camera))
-    passes = {name: partial(run, Backend(name), inputs) for name in ("cpu", "reference")}
+    inputs = prepare_inputs((gaussians, camera))
+    passes = {name: partial(run_passes, Backend(name), inputs) for name in ("cpu", "reference")}
     yield Pair("render", "reference", passes["cpu"], passes["reference"])
     generator = torch.Generator().manual_seed(0)
     photograph = Views(camera, torch.rand(1, 3, SIDE, SIDE, generator=generator))
@@ -84,7 +87,8 @@ def make_pairs() -> Iterator[Pair]:
     visible = torch.rand(ROWS, generator=generator) < 0.5
     steps = []
     for step in (adam_step_cpu, adam_step_reference):
-        numbers = torch.rand(4, ROWS, 12, generator=generator)  # mean and square: above 0
+        # Parameters, gradients and both averages; a mean square is not negative
+        numbers = torch.rand(4, ROWS, 12, generator=generator)
         rows = Rows(*numbers, torch.zeros(ROWS, dtype=torch.int32), torch.full((12,), 1e-3))
         steps.append(partial(step, [rows], visible, AdamSettings(0.9, 0.999, 1e-15)))
     yield Pair("adam", "reference", *steps)
@@ -98,7 +102,7 @@ def make_pairs() -> Iterator[Pair]:
 
 
 class RecordProducts(TorchDispatchMode):
-    """Records the matrix products and convolutions that are called, also in attention and SSD."""
+    """The matrix products and convolutions called in a context, those in attention and SSD too."""
 
     def __init__(self):
         super().__init__()
@@ -115,7 +119,7 @@ class RecordProducts(TorchDispatchMode):
         elif func._schema.name == "asysplat::ssd":
             (batch, length, heads, head_dim), state = args[1].shape, args[4].shape[-1]
             chunks, inner = batch * -(-length // CHUNK), heads * head_dim
-            # Scores, scores x inputs, the update of the state and its reading
+            # Scores, scores x inputs, the update of the state, and the output from the state
             sizes = [(chunks, CHUNK, state, CHUNK), (chunks * heads, CHUNK, CHUNK, head_dim)]
             sizes += [(chunks, state, CHUNK, inner), (chunks, CHUNK, state, inner)]
         for b, m, k, n in sizes:
@@ -131,29 +135,32 @@ class RecordProducts(TorchDispatchMode):
 def measure(options: DictConfig, console: Console) -> Result:
     """Time every workload and its baseline one after the other, in `options.repeats` rounds.
 
-    On one thread, in processor time: other programs on the machine do not count. "rows" have the
-    "seconds", those of the "baseline", and the "ratio" of both in the same round.
+    Times are processor times on one thread, so that other programs on the machine do not count.
+
+    Returns:
+        "rows": the "seconds" of each workload and of its "baseline", and the "ratio" of both in the
+        same round.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         pairs = list(make_pairs())
-        rounds = [Measurement(partial(_seconds, pair)) for pair in pairs]
+        rounds = [Measurement(partial(_time_pair, pair)) for pair in pairs]
         time_in_rounds(rounds, options.repeats, console)
     finally:
         torch.set_num_threads(threads)
     rows = []
     for pair, timed in zip(pairs, rounds, strict=True):
         seconds, baseline = timed.seconds["workload"], timed.seconds["baseline"]
-        row = {"workload": pair.name, "over": pair.over}
-        row |= {"seconds": summary(seconds), "baseline": summary(baseline)}
+        row = {"workload": pair.name, "baseline_name": pair.baseline_name}
+        row |= {"seconds": summarize(seconds), "baseline": summarize(baseline)}
         ratios = [a / b for a, b in zip(seconds, baseline, strict=True)]
-        rows.append(row | {"ratio": summary(ratios)})
+        rows.append(row | {"ratio": summarize(ratios)})
     return {"rows": rows}
 
 
-def _seconds(pair: Pair) -> dict[str, float]:
-    """Return the least processor time of BEST_OF runs of both, in seconds."""
+def _time_pair(pair: Pair) -> dict[str, float]:
+    """Return the least processor time of BEST_OF runs of the workload and of the baseline."""
     seconds = {}
     for name in ("workload", "baseline"):
         times = [time.process_time()]
@@ -167,8 +174,8 @@ def _seconds(pair: Pair) -> dict[str, float]:
 def tables(results: Result) -> list[Table]:
     """Show the ratio of each workload to its baseline."""
     columns = {
-        "workload": text("{workload}"),
-        "baseline": text("its {over}"),
+        "workload": text_column("{workload}"),
+        "baseline": text_column("its {baseline_name}"),
         "ms": median_iqr_column("seconds", "{:.2f}"),
         "baseline\nms": median_iqr_column("baseline", "{:.2f}"),
         "ratio": median_iqr_column("ratio", "{:.3f}", unit=1.0),

@@ -8,25 +8,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 from asysplat.errors import InputError
-from benchmarks.table import at, worst
+from benchmarks.table import largest_at, value_at
 from benchmarks.timing import Result
 
-MACHINE = ("cpu", "instructions", "cores", "threads", "gpu")  # what times depend on
-NO_ERROR = 1e-12  # errors below are taken for it
+MACHINE = ("cpu", "instructions", "cores", "threads", "gpu")  # properties that times depend on
+NO_ERROR = 1e-12  # smaller numbers are raised to it, so that ratios stay finite
 
 
 class Kind(NamedTuple):
-    """The kind of a number, and from which change on it counts."""
+    """A kind of metric: its unit, the words for a change, and the smallest change that counts."""
 
-    unit: str  # dB are compared by their difference, all others by their ratio
-    worse: str  # words for a change
+    unit: str  # "dB" is compared by the difference, every other unit by the ratio
+    worse: str  # word for a change to the worse
     better: str
-    min_change: float  # smallest change that counts, of the logarithm or in dB
-    sign: int = 1  # where more is worse; -1 where less is
-    any_machine: bool = True  # whether it may be compared with another machine's
+    min_change: float  # smallest change that counts: in dB, or of the natural logarithm
+    sign: int = 1  # 1 where more is worse, -1 where less is worse
+    any_machine: bool = True  # False: compared only with results of the same machine
 
     def change(self, old: float, new: float) -> float:
-        """Return how much worse the number became; below 0 where it became better."""
+        """Return how much worse the number became; a negative change is an improvement."""
         if self.unit == "dB":
             return self.sign * (new - old)
         return self.sign * math.log(max(new, NO_ERROR) / max(old, NO_ERROR))
@@ -40,40 +40,43 @@ DECIBELS = Kind("dB", "less exact", "more exact", 0.1, sign=-1)
 LPIPS_DISTANCE = Kind("", "less exact", "more exact", math.log(1.05))
 
 
-class Watched(NamedTuple):
-    """What is compared of a suite's results."""
+class TrackedMetrics(NamedTuple):
+    """The numbers in a suite's results that are compared with older ones.
 
-    names: tuple[str, ...]  # keys of a row that name it
-    alike: tuple[str, ...]  # paths in a row of what must be equal, too: sizes
-    # By the path in a row of a number, of a median with its interquartile range, or of several
-    # numbers, of which the largest is compared.
+    A path such as "error.forward" leads to a value in a row, see `table.value_at`.
+    """
+
+    names: tuple[str, ...]  # keys whose values name a row
+    must_match: tuple[str, ...]  # paths to what two rows must have in common besides: sizes
+    # Paths to a number, to a median with its interquartile range, or to a dictionary of numbers,
+    # of which the largest is compared.
     kinds: Mapping[str, Kind]
-    rows: str = "rows"  # the key of the rows in the results
+    rows: str = "rows"  # key of the rows in the results
 
 
 class Value(NamedTuple):
-    """A number with its interquartile range or the noise that its row names, else 0."""
+    """A number and its noise: its interquartile range, the noise that its row states, or 0."""
 
-    median: float
-    iqr: float
+    number: float
+    noise: float
 
-    def text(self, unit: str) -> str:
-        iqr = f" ± {self.iqr:.2g}" if self.iqr else ""
-        return f"{self.median:.4g}{iqr} {unit}".rstrip()
+    def describe(self, unit: str) -> str:
+        noise = f" ± {self.noise:.2g}" if self.noise else ""
+        return f"{self.number:.4g}{noise} {unit}".rstrip()
 
 
 @dataclass
 class ResultsComparison:
-    """The differences of two files, in words."""
+    """The differences between two result files, one line each."""
 
     worse: list[str] = field(default_factory=list)  # beyond noise
     better: list[str] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)  # only in the old file
+    missing: list[str] = field(default_factory=list)  # numbers only in the old file
     notes: list[str] = field(default_factory=list)  # on what could not be compared
-    compared: int = 0  # numbers
+    compared: int = 0  # count of compared numbers
 
     def lines(self) -> list[str]:
-        """Return all lines, the verdict last."""
+        """Return all lines; the last one sums them up."""
         missing = [f"not measured any more: {what}" for what in self.missing]
         count = f"{len(self.worse)} of" if self.worse else "green: none of"
         verdict = f"{count} {self.compared} numbers became slower or less exact beyond noise."
@@ -81,10 +84,10 @@ class ResultsComparison:
 
 
 def read_old(path: str | None, output: Path) -> Result | None:
-    """Read the results to compare with, if a path is given; the new ones are written to `output`.
+    """Read the results to compare with, if a path is given; new ones will be written to `output`.
 
     Raises:
-        InputError: the file cannot be read, is none of this suite, or would be written over.
+        InputError: the file cannot be read, is not of this suite, or would be overwritten.
     """
     if path is None:
         return None
@@ -105,15 +108,15 @@ def read_old(path: str | None, output: Path) -> Result | None:
     return results
 
 
-def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
-    """Compare all numbers that both results have.
+def compare(old: Result, new: Result, tracked: TrackedMetrics) -> ResultsComparison:
+    """Compare all tracked numbers that both results have.
 
-    A change counts where it is larger than its kind's threshold and than both interquartile ranges.
+    A change counts if it exceeds the threshold of its kind, and the sum of the noise of both.
 
     Raises:
-        InputError: the results have no row in common.
+        InputError: the results have no tracked number in common.
     """
-    before, after = _values(old, watched), _values(new, watched)
+    before, after = _values(old, tracked), _values(new, tracked)
     if before and not before.keys() & after.keys():
         raise InputError(
             "compare= has none of the rows that were measured: name a file of the same suite, "
@@ -127,33 +130,33 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
         comparison.notes.append(note)
     for key, was in before.items():
         name, _, path = key
-        kind = watched.kinds[path]
+        kind = tracked.kinds[path]
         if key not in after:
-            comparison.missing.append(f"{name}, {path}: was {was.text(kind.unit)}")
+            comparison.missing.append(f"{name}, {path}: was {was.describe(kind.unit)}")
         elif kind.any_machine or not changed:
             comparison.compared += 1
             is_now = after[key]
-            change = kind.change(was.median, is_now.median)
-            beyond_noise = abs(is_now.median - was.median) > was.iqr + is_now.iqr
+            change = kind.change(was.number, is_now.number)
+            beyond_noise = abs(is_now.number - was.number) > was.noise + is_now.noise
             if beyond_noise and abs(change) > kind.min_change:
                 lines = comparison.worse if change > 0 else comparison.better
                 word = kind.worse if change > 0 else kind.better
-                values = f"{is_now.text(kind.unit)}, was {was.text(kind.unit)}"
+                values = f"{is_now.describe(kind.unit)}, was {was.describe(kind.unit)}"
                 lines.append(f"{word}: {name}, {path}: {values}")
     return comparison
 
 
-def _values(results: Result, watched: Watched) -> dict[tuple[str, str, str], Value]:
-    """Return all watched numbers by their row's name, its sizes as JSON, and the path in it."""
+def _values(results: Result, tracked: TrackedMetrics) -> dict[tuple[str, str, str], Value]:
+    """Return the tracked numbers by the name of their row, its sizes as JSON, and their path."""
     values = {}
-    for row in results.get(watched.rows, []):
-        name = "/".join(str(row[key]) for key in watched.names if row.get(key) is not None)
-        sizes = json.dumps([at(row, path) for path in watched.alike], sort_keys=True)
-        for path in watched.kinds:
-            value = at(row, path)
+    for row in results.get(tracked.rows, []):
+        name = "/".join(str(row[key]) for key in tracked.names if row.get(key) is not None)
+        sizes = json.dumps([value_at(row, path) for path in tracked.must_match], sort_keys=True)
+        for path in tracked.kinds:
+            value = value_at(row, path)
             if isinstance(value, dict) and "median" in value:
                 values[name, sizes, path] = Value(value["median"], value["iqr"])
             elif value not in (None, {}):
-                noise = at(row, f"noise.{path}") or 0.0
-                values[name, sizes, path] = Value(worst(row, path), noise)
+                noise = value_at(row, f"noise.{path}") or 0.0
+                values[name, sizes, path] = Value(largest_at(row, path), noise)
     return values

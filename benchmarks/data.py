@@ -1,4 +1,4 @@
-"""Photographs on disk: seconds to open a scene, and images loaded per second."""
+"""Loading of photographs from disk: seconds to open a scene, and frames loaded per second."""
 
 import json
 from functools import partial
@@ -14,19 +14,21 @@ from rich.table import Table
 
 from asysplat.data import ImageCache, ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.readers.common import opencv_from_opengl
-from benchmarks.compare import RATE, Watched
+from benchmarks.compare import RATE, TrackedMetrics
 from benchmarks.options import CPU
-from benchmarks.table import machine_note, make_table, median_iqr_column, text
-from benchmarks.timing import Measurement, Result, measure_run, summary, time_in_rounds
+from benchmarks.table import machine_note, make_table, median_iqr_column, text_column
+from benchmarks.timing import Measurement, Result, measure_run, summarize, time_in_rounds
 
 NO_CACHE, FILLED = CACHES = ("none", "filled")
-WATCHED = Watched(names=("cache",), alike=(), kinds={"frames_per_second": RATE}, rows="loading")
-RENDERED = (135, 240)  # height, width of the procedural views; enlarged to the photographs' size
+TRACKED = TrackedMetrics(
+    names=("cache",), must_match=(), kinds={"frames_per_second": RATE}, rows="loading"
+)
+RENDERED = (135, 240)  # height and width of the procedural views, before they are enlarged
 RENDERED_VIEWS = 8
 
 
 def write_photographs(folder: Path, frames: int, height: int, width: int) -> Path:
-    """Write a transforms.json and `frames` JPEG files of different bytes; return the folder."""
+    """Write a transforms.json and `frames` JPEG files, no two of equal bytes; return the folder."""
     scene = ProceduralScene(seed=0, height=RENDERED[0], width=RENDERED[1], num_images=frames)
     views = scene.views([number * frames // RENDERED_VIEWS for number in range(RENDERED_VIEWS)])
     # With grain, as photographs have it: flat areas decode faster.
@@ -56,8 +58,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     """Open a scene and load training tasks from it, `options.repeats` times.
 
     Returns:
-        "scene": frames, the photographs' and the views' sizes; "open": seconds to open the scene;
-        "loading": frames a second without a cache on disk and with a filled one.
+        "scene": number of frames, sizes of photographs and views; "open": seconds to open the
+        scene; "loading": frames per second, without a cache on disk and with a filled one.
     """
     config = options.data
     height, width = config.views
@@ -66,10 +68,12 @@ def measure(options: DictConfig, console: Console) -> Result:
     with TemporaryDirectory() as folder:
         root = write_photographs(Path(folder) / "scene", config.frames, *config.photographs)
 
-        def loading(cache: ImageCache | None) -> float:
+        def time_loading(cache: ImageCache | None) -> float:
             data = files_data(
-                **{"height": height, "width": width, "inputs": config.inputs},
                 root=str(root),
+                height=height,
+                width=width,
+                inputs=config.inputs,
                 window=[frames, 128],
                 name="benchmark",
                 targets=config.targets,
@@ -81,28 +85,28 @@ def measure(options: DictConfig, console: Console) -> Result:
             )
             return measure_run(lambda: list(data.tasks(0, count)), CPU) / (count * frames)
 
-        def seconds() -> dict[str, float]:
+        def time_once() -> dict[str, float]:
             with TemporaryDirectory(dir=folder) as fresh:
                 open_views = partial(open_scene, root, SceneOptions(height, width))
-                times = {"open": measure_run(open_views, CPU), NO_CACHE: loading(None)}
-                loading(ImageCache(fresh))  # fills it
-                times[FILLED] = loading(ImageCache(fresh))
+                times = {"open": measure_run(open_views, CPU), NO_CACHE: time_loading(None)}
+                time_loading(ImageCache(fresh))  # fills it
+                times[FILLED] = time_loading(ImageCache(fresh))
                 return times
 
-        timed = Measurement(seconds)
+        timed = Measurement(time_once)
         time_in_rounds([timed], options.repeats, console)
-    rates = {name: summary([1 / s for s in timed.seconds[name]]) for name in CACHES}
+    rates = {name: summarize([1 / s for s in timed.seconds[name]]) for name in CACHES}
     loading = [{"cache": name, "frames_per_second": rate} for name, rate in rates.items()]
     scene = {"frames": config.frames, "photographs": list(config.photographs)}
     scene |= {"views": [height, width], "workers": config.num_workers}
-    return {"scene": scene, "open": timed.summary("open"), "loading": loading}
+    return {"scene": scene, "open": timed.summarize("open"), "loading": loading}
 
 
 def tables(results: Result) -> list[Table]:
-    """Show the frames a second of each state of the cache, and the seconds to open a scene."""
+    """Show the frames per second without and with a cache, and the seconds to open a scene."""
     scene = results["scene"]
     columns = {
-        "cache on disk": text("{cache}"),
+        "cache on disk": text_column("{cache}"),
         "frames / s": median_iqr_column("frames_per_second", "{:.0f}", unit=1.0),
     }
     photographs, views = ("x".join(map(str, scene[name])) for name in ("photographs", "views"))

@@ -1,4 +1,4 @@
-"""File formats of a scene: bytes, seconds, and what the rounding changes in the pictures."""
+"""File formats of a scene: size, seconds, and how much rounding changes the pictures."""
 
 import math
 from functools import partial
@@ -20,14 +20,14 @@ from asysplat.export.gaussians import (
 from asysplat.export.likeness import COMPARED_VIEWS, picture_psnr
 from asysplat.export.scene_cameras import cameras_beside
 from asysplat.scene import Gaussians
-from benchmarks.compare import DECIBELS, RATIO, TIME, Watched
+from benchmarks.compare import DECIBELS, RATIO, TIME, TrackedMetrics
 from benchmarks.options import CPU
-from benchmarks.table import machine_note, make_table, median_iqr_column, number, text
+from benchmarks.table import machine_note, make_table, median_iqr_column, number_column, text_column
 from benchmarks.timing import Measurement, Result, measure_run, time_in_rounds
 
-WATCHED = Watched(
+TRACKED = TrackedMetrics(
     names=("format",),
-    alike=("gaussians", "sh_degree"),
+    must_match=("gaussians", "sh_degree"),
     kinds={"megabytes": RATIO, "write": TIME, "read": TIME, "psnr": DECIBELS},
 )
 
@@ -36,11 +36,11 @@ def measure(options: DictConfig, console: Console) -> Result:
     """Write a scene in every format and read it back, `options.repeats` times.
 
     Returns:
-        "rows": for each format megabytes, seconds to write and to read, and the PSNR of its
-        pictures against the original's.
+        "rows": for each format, its megabytes, seconds to write and to read, and the PSNR of its
+        pictures against those of the original.
 
     Raises:
-        InputError: no file of Gaussians, or none with its cameras beside it.
+        InputError: `options.formats.scene` is missing, or has no cameras beside it.
     """
     if options.formats.scene is None:
         raise InputError("formats.scene is missing: give the scene.ply of a reconstruction.")
@@ -56,19 +56,19 @@ def measure(options: DictConfig, console: Console) -> Result:
     common = {"gaussians": gaussians.num_gaussians, "sh_degree": degree}
     with TemporaryDirectory() as folder:
         files = [Path(folder) / f"scene{suffix}" for suffix in WRITERS]
-        timed = [Measurement(partial(_seconds, path, gaussians)) for path in files]
+        timed = [Measurement(partial(_time_format, path, gaussians)) for path in files]
         time_in_rounds(timed, options.repeats, console)
         rows = []
         for suffix, path, measurement in zip(WRITERS, files, timed, strict=True):
             row = {"format": suffix, "megabytes": path.stat().st_size / 1e6} | common
-            row |= {name: measurement.summary(name) for name in measurement.seconds}
+            row |= {name: measurement.summarize(name) for name in measurement.seconds}
             if path.suffix in READERS:
                 row["psnr"] = picture_psnr(gaussians, read_gaussians(path), cameras, notes)
             rows.append(row)
     return {"rows": rows}
 
 
-def _seconds(path: Path, gaussians: Gaussians) -> dict[str, float]:
+def _time_format(path: Path, gaussians: Gaussians) -> dict[str, float]:
     seconds = {"write": measure_run(partial(write_gaussians, path, gaussians), CPU)}
     if path.suffix in READERS:
         seconds["read"] = measure_run(partial(read_gaussians, path), CPU)
@@ -76,13 +76,13 @@ def _seconds(path: Path, gaussians: Gaussians) -> dict[str, float]:
 
 
 def tables(results: Result) -> list[Table]:
-    """Show every format's size, seconds, and likeness."""
+    """Show the size, seconds and PSNR of every format."""
     columns = {
-        "format": text("{format}"),
-        "MB": number("megabytes", "{:.2f}"),
+        "format": text_column("{format}"),
+        "MB": number_column("megabytes", "{:.2f}"),
         "write (s)": median_iqr_column("write", "{:.2f}", unit=1.0),
         "read (s)": median_iqr_column("read", "{:.2f}", unit=1.0),
-        "pictures (dB)": number("psnr", "{:.1f}"),
+        "pictures (dB)": number_column("psnr", "{:.1f}"),
     }
     first = results["rows"][0]
     notes = (

@@ -1,4 +1,4 @@
-"""Whole networks: seconds of a forward pass and of a training step, and their parts."""
+"""Whole networks: seconds of a training step, and of a forward pass and its parts."""
 
 import inspect
 import sys
@@ -23,19 +23,19 @@ from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
 from asysplat.runs.device import find_device
 from asysplat.scene import Gaussians, Views
-from benchmarks.compare import TIME, Watched
+from benchmarks.compare import TIME, TrackedMetrics
 from benchmarks.options import PRECISIONS, check_names
 from benchmarks.plot import bars
-from benchmarks.scenes import on_an_arc, random_scene
-from benchmarks.table import machine_note, make_table, median_iqr_column, number, text
+from benchmarks.scenes import place_on_arc, random_scene
+from benchmarks.table import machine_note, make_table, median_iqr_column, number_column, text_column
 from benchmarks.timing import Measurement, Result, Run, device_time, measure_run, time_in_rounds
 
-WATCHED = Watched(
+TRACKED = TrackedMetrics(
     names=("model", "views", "precision"),
-    alike=("parameters", "height", "width"),
+    must_match=("parameters", "height", "width"),
     kinds=dict.fromkeys(("forward", "step"), TIME),
 )
-COMPONENTS = {  # none within another
+COMPONENTS = {  # layers, none of which contains another
     "tokenizer": (Tokenizer,),
     "Mamba2": (models.BiMamba2,),
     "sparse attention": (models.SparseAttention,),
@@ -54,7 +54,7 @@ NOTES = "step: forward and backward; -: not measured"
 
 @dataclass(frozen=True)
 class Workload:
-    """A network, its input and their precision."""
+    """A network, its input, and the precision of its forward pass."""
 
     net: Network  # with random weights
     precision: str  # key of PRECISIONS; bf16 by autocast
@@ -70,7 +70,7 @@ class Workload:
             return self.net(self.views)
 
     def step(self) -> None:
-        """Run a training step without renderer and optimizer: the loss is a mean of the outputs."""
+        """Run a training step, in which the sum of the fields' means replaces render and loss."""
         self.net.train()
         with self._autocast(self.device.type):
             gaussians = self.net(self.views)
@@ -86,10 +86,13 @@ class Workload:
 def make_net(
     name: str, overrides: Mapping[str, object], device: torch.device
 ) -> tuple[Network, dict[str, int]]:
-    """Build the network that train.py would; return also its number of inputs, height and width.
+    """Build the network that train.py would build.
+
+    Returns:
+        The network, and its "inputs" (number of input views), "height" and "width".
 
     Raises:
-        InputError: an unknown model, or an unknown choice among the overrides.
+        InputError: the model is unknown, or an override is.
     """
     command = [f"model={name}", *(f"{key}={value}" for key, value in overrides.items())]
     check_overrides(command)
@@ -101,14 +104,14 @@ def make_net(
 
 
 def make_views(views: int, height: int, width: int, device: torch.device) -> Views:
-    """Make views of noise, from cameras on an arc."""
+    """Make views of noise from cameras on an arc; the same numbers at every call."""
     _, camera = random_scene(1, height, width)
     images = torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
-    return Views(on_an_arc(camera, views), images).to(device)
+    return Views(place_on_arc(camera, views), images).to(device)
 
 
-def part_seconds(forward: Run, device: torch.device) -> dict[str, float]:
-    """Time one forward pass in each of PARTS and, within them, in each of OPERATORS."""
+def time_parts(forward: Run, device: torch.device) -> dict[str, float]:
+    """Return the seconds of a forward pass in each of PARTS and, within these, of OPERATORS."""
     seconds: dict[str, float] = {}
 
     def profile(frame: FrameType, event: str, _: object) -> None:
@@ -134,8 +137,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     """Time every network of `options.model`, `options.repeats` times.
 
     Returns:
-        "rows": one for each network, number of views and precision, times in seconds. A step that
-        is not measured is None.
+        "rows": one for each network, number of views and precision, with times in seconds; "step"
+        is None if it is not measured.
     """
     device, config = find_device(options.device), options.model
     check_names("model.precisions", config.precisions, PRECISIONS)
@@ -149,27 +152,27 @@ def measure(options: DictConfig, console: Console) -> Result:
             row |= {"height": size["height"], "width": size["width"]}
             for precision in config.precisions:
                 workload = Workload(net, precision, views)
-                timer = partial(_seconds, workload, config.steps)
+                timer = partial(_time_workload, workload, config.steps)
                 measurements.append(Measurement(timer, row | {"precision": precision}))
     time_in_rounds(measurements, options.repeats, console)
     rows = []
     for timed in measurements:
-        times = {name: timed.summary(name) for name in timed.seconds}
+        times = {name: timed.summarize(name) for name in timed.seconds}
         row = timed.row | {"forward": times["forward"], "step": times.get("step")}
         row["components"] = {name: {"seconds": times[name]} for name in PARTS if name in times}
         rows.append(row | {"operators": {name: times[name] for name in OPERATORS if name in times}})
     return {"rows": rows}
 
 
-def _seconds(workload: Workload, step: bool) -> dict[str, float]:
+def _time_workload(workload: Workload, step: bool) -> dict[str, float]:
     seconds = {"forward": measure_run(workload.forward, workload.device)}
     if step:
         seconds["step"] = measure_run(workload.step, workload.device)
-    return seconds | part_seconds(workload.forward, workload.device)
+    return seconds | time_parts(workload.forward, workload.device)
 
 
 def tables(results: Result) -> list[Table]:
-    """Show every network, and what its forward pass consists of."""
+    """Show the times of every network, and the share of each part in its forward pass."""
     rows, parts = results["rows"], []
     for row in rows:
         timed = {name: part["seconds"] for name, part in row["components"].items()}
@@ -178,17 +181,17 @@ def tables(results: Result) -> list[Table]:
             fraction = seconds["median"] / row["forward"]["median"]
             parts.append(row | {"part": name, "seconds": seconds, "share": fraction})
     networks = {
-        "model": text("{model}"),
-        "inputs": text("{views} x {height}x{width}, {precision}"),
+        "model": text_column("{model}"),
+        "inputs": text_column("{views} x {height}x{width}, {precision}"),
         "forward\nms": median_iqr_column("forward"),
         "step\nms": median_iqr_column("step"),
     }
     components = {
-        "model": text("{model}"),
-        "inputs": text("{views} views, {precision}"),
-        "component": text("{part}"),
+        "model": text_column("{model}"),
+        "inputs": text_column("{views} views, {precision}"),
+        "component": text_column("{part}"),
         "ms": median_iqr_column("seconds"),
-        "share\n%": number("share", "{:.1f}", unit=0.01),
+        "share\n%": number_column("share", "{:.1f}", unit=0.01),
     }
     part_notes = "of which: operators, within the components that call them"
     return [
@@ -198,7 +201,7 @@ def tables(results: Result) -> list[Table]:
 
 
 def plot(results: Result) -> Figure:
-    """Plot the parts of a forward pass, for each view."""
+    """Plot the milliseconds of each part of a forward pass, per input view."""
     rows = results["rows"]
 
     def milliseconds(part: str) -> list[float]:
@@ -207,5 +210,5 @@ def plot(results: Result) -> Figure:
         return [1000 * median / row["views"] for row, median in zip(rows, medians, strict=True)]
 
     names = [f"{row['model']}, {row['views']} views, {row['precision']}" for row in rows]
-    label = "milliseconds of a forward pass for each view"
+    label = "milliseconds of a forward pass per view"
     return bars(names, {part: milliseconds(part) for part in PARTS}, label)

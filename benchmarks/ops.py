@@ -1,4 +1,4 @@
-"""Every backend of the operators: time, also relative to the sequential loop, and error."""
+"""Every backend of the operators: time, speedup over the sequential loop, and error."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -17,56 +17,64 @@ from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.runs.device import find_device
 from asysplat.scene import Cameras
 from benchmarks import timing
-from benchmarks.compare import ERROR, TIME, Watched
+from benchmarks.compare import ERROR, TIME, TrackedMetrics
 from benchmarks.options import PRECISIONS, check_names
-from benchmarks.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
-from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
+from benchmarks.scenes import DISTANCE, FOCAL, camera_at_origin, place_on_arc, random_numbers
+from benchmarks.table import (
+    error_column,
+    machine_note,
+    make_table,
+    median_iqr_column,
+    number_column,
+    text_column,
+)
 from benchmarks.timing import Measurement, Result, relative_l2
 
 PASSES = {"forward": "Forward", "forward_backward": "Forward and backward"}
 ERRORS = {"forward": "error.forward", "forward_backward": "error.gradients"}
-WATCHED = Watched(
+TRACKED = TrackedMetrics(
     names=("operator", "precision", "path"),
-    alike=("sizes", "loop_tokens", "error.measured_on"),
+    must_match=("sizes", "loop_tokens", "error.measured_on"),
     kinds=dict.fromkeys(PASSES, TIME) | dict.fromkeys(ERRORS.values(), ERROR),
 )
 LOOP, REFERENCE = "loop", "reference"
 NOTES = """\
-loop: reference.py in fp32 on {loop} tokens, times scaled to the whole sequence; of plane_sweep \
-the reference
-error: against the reference in float64, relative in L2; *: of a smaller one of its kind"""
+loop: reference.py in fp32 on {loop} tokens, its times scaled to the whole sequence; for \
+plane_sweep, the reference at full size
+error: relative L2 error against the reference in float64; *: measured on smaller inputs"""
 
-STEPS = (1e-3, 1e-1)  # dt of an untrained network
+STEPS = (1e-3, 1e-1)  # range of dt in an untrained network
 SCANS = ("ssd", "selective_scan")
 ATTENTION, PLANE_SWEEP = "grid_attention", "plane_sweep"
-FP32_INPUTS = ("dt", "A", "D")
-# The shape of each input, in the order that they are drawn.
+FP32_INPUTS = ("dt", "A", "D")  # inputs of a scan that stay fp32
+# The shape of each input, in the order in which they are drawn.
 SHAPES = {
-    # A Mamba2 layer's scan, of one direction
+    # The scan of a Mamba2 layer, in one direction
     "ssd": {"x": "batch length heads head_dim", "dt": "batch length heads", "A": "heads"}
     | {**dict.fromkeys("BC", "batch length state"), "D": "heads"},
-    # A MambaVision layer's scan: each image is a sequence
+    # The scan of a MambaVision layer: each image is a sequence
     "selective_scan": {**dict.fromkeys(("x", "dt"), "batch length channels"), "A": "channels state"}
     | {**dict.fromkeys("BC", "batch length state"), "D": "channels"},
     # One attention layer; grid 1 is full attention
     ATTENTION: dict.fromkeys("qkv", "batch views height width heads head_dim"),
 }
-# The backends beside "cpu" or "cuda", and the sizes that are arguments of the operator.
+# The backend measured beside "cpu" or "cuda", and the sizes that are arguments of the operator.
 BACKENDS = dict.fromkeys(SCANS, "chunked") | {ATTENTION: "sdpa", PLANE_SWEEP: REFERENCE}
 ARGUMENTS = dict.fromkeys(SCANS, ()) | {ATTENTION: ("grid",)}
 ARGUMENTS[PLANE_SWEEP] = ("planes", "neighbors")
-# The plane sweep's scene: cameras on an arc before a slanted wall with a texture.
-SLANT = 0.3  # depth that the wall gains with each unit to the right
-WAVES = 20  # sine waves in each color channel
+# The scene of the plane sweep: cameras on an arc in front of a slanted, textured wall.
+SLANT = 0.3  # increase of the wall's depth with each unit to the right
+WAVES = 20  # sine waves in each color channel of the texture
 
 Tensors = dict[str, Tensor]
-Sizes = Mapping[str, int]  # sizes of the inputs, named as in SHAPES, and the operator's arguments
+Sizes = Mapping[str, int]  # sizes of the inputs, named as in SHAPES, and arguments of the operator
 
 
 def make_inputs(operator: str, sizes: Sizes) -> Tensors:
-    """Make inputs in float64; the same numbers at every call."""
+    """Make the inputs of an operator in float64; the same numbers at every call."""
     if operator == PLANE_SWEEP:
-        return _make_views(**{name: sizes[name] for name in ("batch", "views", "height", "width")})
+        names = ("batch", "views", "height", "width")
+        return _make_plane_sweep_inputs(*(sizes[name] for name in names))
     uniform, normal = random_numbers(0)
     tensors = {}
     for name, sides in SHAPES[operator].items():
@@ -84,14 +92,14 @@ def make_inputs(operator: str, sizes: Sizes) -> Tensors:
     return tensors
 
 
-def _make_views(batch: int, views: int, height: int, width: int) -> Tensors:
-    """Make images of a wall at about DISTANCE, z = DISTANCE + SLANT x, and their cameras."""
+def _make_plane_sweep_inputs(batch: int, views: int, height: int, width: int) -> Tensors:
+    """Make images of the wall z = DISTANCE + SLANT x, and their cameras."""
     camera = camera_at_origin(FOCAL * width, height, width)
-    cameras = on_an_arc(camera, views).to(torch.float64)
+    cameras = place_on_arc(camera, views).to(torch.float64)
     origins, directions = cameras.rays()
-    missing = DISTANCE + SLANT * origins[..., 0] - origins[..., 2]
-    along = missing / (directions[..., 2] - SLANT * directions[..., 0])
-    points = (origins + along[..., None] * directions)[..., :2]
+    offsets = DISTANCE + SLANT * origins[..., 0] - origins[..., 2]  # from the wall, along z
+    distances = offsets / (directions[..., 2] - SLANT * directions[..., 0])
+    points = (origins + distances[..., None] * directions)[..., :2]
     uniform, normal = random_numbers(0)
     waves, phases = 6 * normal(3, WAVES, 2), 2 * math.pi * uniform(3, WAVES)
     angles = torch.einsum("vhwi,cni->vcnhw", points, waves) + phases[..., None, None]
@@ -102,17 +110,17 @@ def _make_views(batch: int, views: int, height: int, width: int) -> Tensors:
 
 
 @dataclass(frozen=True)
-class Path:
-    """A backend of an operator, with inputs."""
+class OperatorPath:
+    """A backend of an operator, and inputs to run it on."""
 
     operator: str  # name in `asysplat.ops`
     sizes: Sizes
     backend: str
-    inputs: Tensors  # tensors that require gradients
-    weights: Tensor  # the gradient of the output, from a normal distribution
+    inputs: Tensors  # each requires a gradient
+    weights: Tensor  # gradient of the output
 
     def run(self) -> Tensor:
-        """Return the output; of a plane sweep the inverse depths."""
+        """Return the output, for a plane sweep its inverse depths."""
         options = {name: self.sizes[name] for name in ARGUMENTS[self.operator]}
         options["backend"] = self.backend
         if self.operator != PLANE_SWEEP:
@@ -125,52 +133,53 @@ class Path:
         return self.run()
 
     def forward_backward(self) -> tuple[Tensor, Tensors]:
-        """Return the output, and the gradient of each input; a plane sweep has none."""
+        """Return the output, and the gradient of each input; a plane sweep has no gradients."""
         if self.operator == PLANE_SWEEP:
             return self.forward(), {}
         output = self.run()
         gradients = torch.autograd.grad(output, list(self.inputs.values()), self.weights)
         return output.detach(), dict(zip(self.inputs, gradients, strict=True))
 
-    def seconds(self) -> dict[str, float]:
-        """Time each pass once."""
-        names = list(PASSES)[: 1 if self.operator == PLANE_SWEEP else 2]
+    def time_passes(self) -> dict[str, float]:
+        """Run each pass once; return its seconds."""
+        names = ("forward",) if self.operator == PLANE_SWEEP else PASSES
         return {n: timing.measure_run(getattr(self, n), self.weights.device) for n in names}
 
-    def exact(self) -> tuple[Tensor, Tensors]:
-        """Run the reference in float64 on the CPU, on inputs rounded as this path's are."""
+    def run_exact(self) -> tuple[Tensor, Tensors]:
+        """Run the reference in float64 on the CPU, on the same numbers as this path."""
         inputs = {n: t.detach().cpu().double().requires_grad_() for n, t in self.inputs.items()}
         weights = self.weights.cpu().double()
-        return Path(self.operator, self.sizes, REFERENCE, inputs, weights).forward_backward()
+        exact = OperatorPath(self.operator, self.sizes, REFERENCE, inputs, weights)
+        return exact.forward_backward()
 
-    def errors(self, exact: tuple[Tensor, Tensors]) -> Result:
-        """Compare the output and the gradient of each input with the exact ones, relative in L2."""
+    def measure_errors(self, exact: tuple[Tensor, Tensors]) -> Result:
+        """Return the relative L2 errors of the output and of the gradient of each input."""
         output, gradients = self.forward_backward()
         errors = {name: relative_l2(gradients[name], true) for name, true in exact[1].items()}
-        sizes, forward = dict(self.sizes), relative_l2(output, exact[0])
-        return {"measured_on": sizes, "forward": forward, "gradients": errors or None}
+        forward = relative_l2(output, exact[0])
+        return {"measured_on": dict(self.sizes), "forward": forward, "gradients": errors or None}
 
 
 def make_path(
     operator: str, sizes: Sizes, backend: str, dtype: torch.dtype, device: torch.device
-) -> Path:
-    """Make a path on the inputs of an operator, in `dtype` but for FP32_INPUTS."""
+) -> OperatorPath:
+    """Make a path with inputs in `dtype`, except for FP32_INPUTS; the same at every call."""
     inputs = {}
     for name, tensor in make_inputs(operator, sizes).items():
         input_dtype = torch.float32 if name in FP32_INPUTS else dtype
         inputs[name] = tensor.to(device, input_dtype).requires_grad_()
-    first = next(iter(inputs.values()))  # the output has its shape and type
+    first = next(iter(inputs.values()))  # has the shape and type of the output
     weights = torch.randn(first.shape, generator=torch.Generator().manual_seed(1))
-    return Path(operator, sizes, backend, inputs, weights.to(first))
+    return OperatorPath(operator, sizes, backend, inputs, weights.to(first))
 
 
 def measure(options: DictConfig, console: Console) -> Result:
-    """Time every path of every operator, `options.repeats` times, at the sizes `options.ops`.
+    """Time every path of every operator, `options.repeats` times, at the sizes in `options.ops`.
 
     Returns:
-        "rows": one for each operator, precision and path, times in seconds. The path "loop" is the
-        reference in fp32 on a shorter sequence, its times scaled to the whole. plane_sweep has
-        none and no gradients, but its reference on all pixels.
+        "rows": one for each operator, precision and path, with times in seconds. The path "loop" of
+        a scan is the reference in fp32 on a shorter sequence, its times scaled to the whole one.
+        plane_sweep has the reference at full size instead, and no gradients.
     """
     device = find_device(options.device)
     sizes = OmegaConf.to_container(options.ops, resolve=True)
@@ -183,10 +192,10 @@ def measure(options: DictConfig, console: Console) -> Result:
     for operator, case_sizes in track(cases, "operators", console=console):
         exact = case_sizes | sizes["exact"][operator]
         tokens, precisions = sizes["loop_tokens"], sizes["precisions"]
-        measurements = list(make_rows(operator, case_sizes, exact, precisions, tokens, device))
+        measurements = [*make_measurements(operator, case_sizes, exact, precisions, tokens, device)]
         timing.time_in_rounds(measurements, options.repeats)
         rows = [
-            timed.row | {n: timed.summary(n) if n in timed.seconds else None for n in PASSES}
+            timed.row | {n: timed.summarize(n) if n in timed.seconds else None for n in PASSES}
             for timed in measurements
         ]
         slow = (LOOP, REFERENCE)
@@ -199,7 +208,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     return {"rows": results}
 
 
-def make_rows(
+def make_measurements(
     operator: str,
     sizes: Sizes,
     exact_sizes: Sizes,
@@ -207,10 +216,13 @@ def make_rows(
     loop_tokens: int,
     device: torch.device,
 ) -> Iterator[Measurement]:
-    """Yield the measurements of one operator: its paths, then the loop.
+    """Yield the measurements of one operator: its backends, then the sequential loop of a scan.
 
-    Errors are measured at `exact_sizes`. `precisions` are those of the inputs; a plane sweep has
-    fp32 alone. The loop is timed on `loop_tokens`.
+    Args:
+        sizes: sizes at which time is measured.
+        exact_sizes: sizes at which errors are measured.
+        precisions: precisions of the inputs; a plane sweep has only fp32.
+        loop_tokens: length of the sequence on which the loop is timed.
     """
     name = f"{operator}/{sizes['grid']}" if "grid" in sizes else operator
     row = {"operator": name, "sizes": dict(sizes)}
@@ -218,43 +230,44 @@ def make_rows(
         if operator == PLANE_SWEEP and precision != "fp32":
             continue
         dtype = PRECISIONS[precision]
-        exact = make_path(operator, exact_sizes, REFERENCE, dtype, device).exact()
+        exact = make_path(operator, exact_sizes, REFERENCE, dtype, device).run_exact()
         for backend in (BACKENDS[operator], device.type):
             try:
-                errors = make_path(operator, exact_sizes, backend, dtype, device).errors(exact)
+                small = make_path(operator, exact_sizes, backend, dtype, device)
+                errors = small.measure_errors(exact)
             except InputError:  # the operator has no such backend, or it cannot run here
                 continue
             path = make_path(operator, sizes, backend, dtype, device)
             values = {"precision": precision, "path": backend, "error": errors}
-            yield Measurement(path.seconds, row | values)
-    if operator in SCANS:  # the reference in fp32, which takes one token after the other
-        reference = make_path(operator, exact_sizes, REFERENCE, torch.float32, device)
+            yield Measurement(path.time_passes, row | values)
+    if operator in SCANS:  # the reference processes one token after another
+        small = make_path(operator, exact_sizes, REFERENCE, torch.float32, device)
         length = min(loop_tokens, sizes["length"])
         path = make_path(operator, sizes | {"length": length}, REFERENCE, torch.float32, device)
 
-        def seconds() -> dict[str, float]:
+        def time_loop() -> dict[str, float]:
             scale = sizes["length"] / length
-            return {name: scale * value for name, value in path.seconds().items()}
+            return {name: scale * value for name, value in path.time_passes().items()}
 
-        errors = reference.errors(reference.exact())
+        errors = small.measure_errors(small.run_exact())
         values = {"precision": "fp32", "path": LOOP, "error": errors, "loop_tokens": length}
-        yield Measurement(seconds, row | values)
+        yield Measurement(time_loop, row | values)
 
 
 def tables(results: Result) -> list[Table]:
-    """Show each pass: its time, against the sequential loop; error."""
+    """Show the time, the speedup over the sequential loop, and the error of each pass."""
     rows = results["rows"]
     loop = max((row["loop_tokens"] for row in rows if row["path"] == LOOP), default=0)
     notes = f"{machine_note(results)}\n{NOTES.format(loop=loop)}"
     shown = []
     for name, title in PASSES.items():
         columns = {
-            "operator": text("{operator}"),
-            "inputs": text("{precision}"),
-            "path": text("{path}"),
+            "operator": text_column("{operator}"),
+            "inputs": text_column("{precision}"),
+            "path": text_column("{path}"),
             "ms": median_iqr_column(name),
-            "loop\n/ path": number(f"faster_than_loop.{name}", "{:.1f}"),
-            "error": error(ERRORS[name]),
+            "loop\n/ path": number_column(f"faster_than_loop.{name}", "{:.1f}"),
+            "error": error_column(ERRORS[name]),
         }
         shown.append(make_table(title, columns, [row for row in rows if row[name]], notes, 3))
     return shown

@@ -1,4 +1,4 @@
-"""The options that several suites share, and the machine that they run on."""
+"""Checks of the options that several suites share, and the machine that the suites run on."""
 
 import os
 import platform
@@ -22,20 +22,28 @@ CPU = torch.device("cpu")
 
 
 def find_suite(name: str) -> ModuleType:
-    """Import the suite called `name`; raise InputError where no suite has this name."""
+    """Import the suite called `name`.
+
+    Raises:
+        InputError: no suite has this name.
+    """
     check_names("suite", [name], SUITES)
     return import_module(SUITES[name])
 
 
 def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raise InputError unless this option has at least one name, and all names are known."""
+    """Check the names that an option was given.
+
+    Raises:
+        InputError: the option has no name, or one that is not among `known`.
+    """
     for name in list(names) or [None]:
         if name not in known:
             raise InputError(f"{option}={name} is unknown: choose from {', '.join(known)}.")
 
 
 def describe_machine() -> dict[str, str | int]:
-    """Return the processor, cores, torch's threads, the GPU if any, and versions of packages."""
+    """Return the processor, its cores, torch's threads, any GPU, and versions of packages."""
     machine = {
         "cpu": processor(),
         "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for

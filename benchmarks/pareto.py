@@ -1,7 +1,7 @@
 """Run time against error: every variant of a prediction and of a refinement, one at a time.
 
-A setting renders all held-out views of a scene from photographs in memory. A variant is what a
-setting changes of the base of its family.
+A setting says how the held-out views of a scene are rendered from its photographs. A family of
+settings consists of a base and of variants, each of which changes some values of the base.
 """
 
 import math
@@ -46,25 +46,34 @@ from asysplat.report.style import FAINT, OURS, STYLE
 from asysplat.runs.device import find_device
 from asysplat.scene import Views
 from benchmarks import timing
-from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
+from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, TrackedMetrics
 from benchmarks.options import CPU, PRECISIONS, check_names
-from benchmarks.table import Columns, machine_note, make_table, median_iqr_column, number, text
-from benchmarks.timing import Measurement, Result, summary
+from benchmarks.table import (
+    Columns,
+    machine_note,
+    make_table,
+    median_iqr_column,
+    number_column,
+    text_column,
+)
+from benchmarks.timing import Measurement, Result, summarize
 
-WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers of a setting
-BASE = "base"  # the setting that each variant changes
+# Values of a setting that must be whole numbers
+WHOLE_NUMBERS = {"views", "side", "max_gaussians", "views_at_once", "steps"}
+BASE = "base"  # name of the setting that each variant changes
 EXACT = "fp64"
-SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
+SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless the family sets its own
 FRAMES = 96  # frames of a procedural scene
-PROCEDURAL = {"room": "rooms", "outdoors": "outdoors"}  # test scenes, by their `places`
-REAL = ("fern", "fox", "hololens-000", "mydesk")  # folders of data/; others may be there, too
+PROCEDURAL = {"room": "rooms", "outdoors": "outdoors"}  # test scenes: name, and `places`
+REAL = ("fern", "fox", "hololens-000", "mydesk")  # known folders of data/, absent or not
 HELD_OUT_EVERY = 8
-MIN_SQUARED_ERROR = 1e-20  # error of equal images: 200 dB, as JSON has no infinity
-# The PSNR after so many seconds depends on the load of the machine: half of 0.5 dB, and of LPIPS.
+MIN_SQUARED_ERROR = 1e-20  # equal images have 200 dB, since JSON has no infinity
+# Metrics after a number of seconds depend on the load of the machine. Two results are compared by
+# the sum of their noise: 0.5 dB, and 0.04 of LPIPS.
 NOISE_OF_SECONDS = {"psnr": 0.25, "lpips": 0.02}
-WATCHED = Watched(
+TRACKED = TrackedMetrics(
     names=("family", "scene", "setting"),
-    alike=("side", "values"),
+    must_match=("side", "values"),
     kinds={"seconds": TIME, "error.decibels": DECIBELS._replace(min_change=1.0)}
     | {"psnr": DECIBELS, "lpips": LPIPS_DISTANCE},
 )
@@ -80,37 +89,38 @@ QUALITIES = {  # higher is better
     "error": "PSNR against the exact images, dB",
 }
 NOTES = f"""\
--: not measured; photographs in memory to all held-out views; / base: in the same round, in turns
+-: not measured; time: from photographs in memory to all held-out views; / base: ratio to the base \
+in the same round
 GB: {PEAK_MEMORY["cpu"]} of the process, {PEAK_MEMORY["cuda"]} on a GPU
-error: of images in [0, 1] against the base in float64, of other layers against their own, of \
-refinements against the base"""
+error: PSNR of images in [0, 1] against the base in float64; of other layers, against the same \
+layers in float64; of refinements, against the base"""
 
 
-class Drawn(NamedTuple):
-    """All held-out views of a scene, and the number of the Gaussians that they show."""
+class RenderedViews(NamedTuple):
+    """All held-out views of a scene as rendered, and the number of Gaussians that they show."""
 
     images: Tensor  # [V, 3, H, W]
-    gaussians: int
+    num_gaussians: int
 
 
-RenderScene = Callable[[Photographs], Drawn]
+RenderScene = Callable[[Photographs], RenderedViews]
 
 
 @dataclass(frozen=True)
 class FeedForward:
-    """A network's prediction, with some of its Gaussians merged or left out, rendered."""
+    """A setting that renders a network's prediction, some of its Gaussians merged or dropped."""
 
     views: int  # input views
     side: int  # side of the input views, in pixels
     checkpoint: str | None = "shipped"  # see `load`; None: untrained
     # Overrides of train.py; with a checkpoint they may change no weights.
     overrides: Sequence[str] = ()
-    precision: str = "fp32"  # fp32; bf16: the network by autocast; fp64: the network and all else
-    min_opacity: float = 0.0  # below which Gaussians are dropped
-    cell: float | None = None  # pixels: Gaussians in a cell are merged; None: none are
-    max_gaussians: int | None = None  # cells grow until so few are left
-    sh_degree: int | None = None  # greatest SH degree rendered; None: all
-    views_at_once: int | None = None  # rendered; None: all
+    precision: str = "fp32"  # fp32; bf16: autocast of the network; fp64: everything in float64
+    min_opacity: float = 0.0  # Gaussians of a lower opacity are dropped
+    cell: float | None = None  # side in pixels of the cells in which Gaussians are merged
+    max_gaussians: int | None = None  # cells grow until at most this many are left; None: no limit
+    sh_degree: int | None = None  # highest SH degree rendered; None: all
+    views_at_once: int | None = None  # number of views rendered together; None: all
     limits: Mapping[str, float] = field(default_factory=dict)  # fields of `BlendingLimits`
 
     def __post_init__(self):
@@ -123,7 +133,11 @@ class FeedForward:
         return self.checkpoint is not None
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Load the network, if its weights fit; return the function that renders a scene."""
+        """Load the network; return the function that renders a scene on the device.
+
+        Raises:
+            InputError: the weights of the checkpoint do not fit the overrides.
+        """
         net = _load_network(self.checkpoint, tuple(self.overrides))
         dtype = torch.float64 if self.precision == EXACT else torch.float32
         if (device, dtype) != (CPU, torch.float32):
@@ -133,7 +147,7 @@ class FeedForward:
         options |= {"depth": False, "limits": replace(INRIA, **self.limits)}
 
         @torch.no_grad()
-        def run(scene: Photographs) -> Drawn:
+        def run(scene: Photographs) -> RenderedViews:
             scene = select_inputs(scene, self.views, self.side)
             inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
             with torch.autocast(device.type, torch.bfloat16, enabled=half):
@@ -145,21 +159,21 @@ class FeedForward:
                 limit = self.max_gaussians or gaussians.num_gaussians
                 gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
             image = render(gaussians, targets.cameras, inputs.mean_color(), **options).image
-            return Drawn(image, gaussians.num_gaussians)
+            return RenderedViews(image, gaussians.num_gaussians)
 
         return run
 
 
 @dataclass(frozen=True)
 class Refined:
-    """A start and a refinement of so many steps or seconds, rendered."""
+    """A setting that renders the refinement of a start, limited in steps or in seconds."""
 
-    views: int | None  # input views; None: all, as they are
-    side: int | None  # side of the input views, in pixels; None with `views`
-    steps: int | None = None  # every round gives the same bits; 0: the start alone
-    seconds: float | int | None = None  # in place of steps
-    init: str = "plane_sweep"  # see `initial_gaussians`; the network is the shipped one
-    refinement: Mapping[str, Any] = field(default_factory=dict)  # over the file of conf/refinement
+    views: int | None  # input views; None: all, at their size
+    side: int | None  # side of the input views, in pixels; None if `views` is None
+    steps: int | None = None  # limit under which every round is the same; 0: the start alone
+    seconds: float | int | None = None  # limit instead of `steps`
+    init: str = "plane_sweep"  # see `initial_gaussians`; "network" is the shipped one
+    refinement: Mapping[str, Any] = field(default_factory=dict)  # overrides of conf/refinement
 
     trained = True
 
@@ -171,7 +185,11 @@ class Refined:
             )
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Check the settings; return the function that renders a scene on the CPU."""
+        """Check the refinement's settings; return the function that renders a scene on the CPU.
+
+        Raises:
+            InputError: a setting of the refinement is unknown or out of range.
+        """
         try:
             settings = instantiate(OmegaConf.merge(refinement, dict(self.refinement)))
         except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
@@ -180,7 +198,7 @@ class Refined:
         net = _load_network("shipped", ()) if self.init == "network" else None
         limit = {"steps": self.steps, "seconds": self.seconds}
 
-        def run(scene: Photographs) -> Drawn:
+        def run(scene: Photographs) -> RenderedViews:
             scene = select_inputs(scene, self.views, self.side)
             gaussians = initial_gaussians(self.init, scene, settings, net)
             color = scene.inputs.mean_color()
@@ -188,7 +206,7 @@ class Refined:
                 gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)
             with torch.no_grad():
                 image = render(gaussians, scene.held_out.cameras, color, depth=False).image
-            return Drawn(image, gaussians.num_gaussians)
+            return RenderedViews(image, gaussians.num_gaussians)
 
         return run
 
@@ -205,10 +223,10 @@ def _load_network(checkpoint: str | None, overrides: tuple[str, ...]) -> Network
 
 
 def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
-    """Return the settings of each family of `config.families`: the base, and those of its variants.
+    """Return the settings of each of `config.families` by name: the base, and the variants.
 
     Raises:
-        InputError: an unknown family, variant or field of a setting, or a value out of range.
+        InputError: a family, a variant or a value is unknown, or a value is out of range.
     """
     check_names("pareto.families", config["families"], FAMILIES)
     families = {}
@@ -221,7 +239,7 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
                 raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
             values = base | changes
             check_names(where, values, [field.name for field in fields(kind)])
-            for count in WHOLE & values.keys():
+            for count in WHOLE_NUMBERS & values.keys():
                 value, minimum = values[count], int(count != "steps")
                 if value is not None and (type(value) is not int or value < minimum):
                     message = f"{where}: {count}={value}: give a whole number from {minimum}."
@@ -242,13 +260,19 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
 def find_scenes(
     names: Sequence[str], folder: Path
 ) -> tuple[dict[str, Callable[[int, int, int], Photographs]], dict[str, str]]:
-    """Return functions that open scenes, and the reasons why others are not measured.
+    """Find scenes by name.
 
-    The functions take the side of the photographs in pixels, and the largest numbers of input and
-    of held-out views. `names` are of PROCEDURAL, REAL, or folders in `folder`.
+    Args:
+        names: names of PROCEDURAL, of REAL, or of folders in `folder`.
+        folder: folder of the real scenes.
+
+    Returns:
+        Functions that open the scenes, and the reasons why other scenes are absent, both by name.
+        The functions take the side of the photographs in pixels, and the largest numbers of input
+        and of held-out views.
 
     Raises:
-        InputError: a name that no scene has, or no scene is there.
+        InputError: a name is unknown, or every scene is absent.
     """
     present = sorted(path.name for path in folder.glob("*") if path.is_dir())
     check_names("pareto.scenes", names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
@@ -277,7 +301,7 @@ def _procedural_scene(name: str, side: int, inputs: int, targets: int) -> Photog
 
 
 def _real_scene(path: Path, side: int, inputs: int, targets: int) -> Photographs:
-    # The check of the cameras needs more pixels: its warning is dropped.
+    # The photographs are too small for the check of the cameras: its warning is dropped.
     limits = {"views": inputs, "held_out_every": HELD_OUT_EVERY, "max_held_out": targets}
     return open_photographs(path, side, side, **limits, say=lambda _: None)
 
@@ -287,12 +311,13 @@ def _without_depths(views: Views) -> Views:
 
 
 def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Photographs:
-    """Return a scene with `views` of its inputs, evenly, of side x side pixels, without depths.
+    """Select evenly spaced input views, resize them to side x side pixels, and normalize anew.
 
-    It is normalized anew. A scene with fewer views gives all of them; None: the scene as it is.
+    Depths are dropped. A scene with fewer than `views` input views keeps them all; one for which
+    `views` or `side` is None is returned as it is.
 
     Raises:
-        InputError: more pixels than the photographs have.
+        InputError: `side` exceeds that of the photographs.
     """
     if views is None or side is None:
         return scene
@@ -320,28 +345,31 @@ def _measure_scene(
     repeats: int,
     advance: Callable[[], None],
 ) -> list[Result]:
-    """Measure all settings in turns, those with a limit in seconds once; return a row for each.
+    """Measure the settings of a family on a scene; return a row for each.
 
-    Networks are on the device, refinements on the CPU. A setting other than BASE that cannot render
-    this scene has no numbers, but the reason in "not_measured". `advance` is called after each of
-    the `count_runs`.
+    Settings with a limit in seconds run once, all others take turns in rounds. Networks run on the
+    device, refinements on the CPU. `advance` is called after each of the `count_runs` runs. The row
+    of a variant that cannot render this scene has the reason in "not_measured", and no numbers.
+
+    Raises:
+        InputError: the base cannot render this scene.
     """
     base = settings[BASE]
-    own_device = CPU if isinstance(base, Refined) else device
-    views = {name: getattr(scene, name).to(own_device) for name in ("inputs", "held_out")}
+    family_device = CPU if isinstance(base, Refined) else device
+    views = {name: getattr(scene, name).to(family_device) for name in ("inputs", "held_out")}
     scene = replace(scene, **views)
-    drawn, measurements, absent = {}, {}, {}
-    meters = {name: CostMeter(own_device) for name in settings}
+    renderings, measurements, absent = {}, {}, {}
+    meters = {name: CostMeter(family_device) for name in settings}
 
     def run(name: str) -> dict[str, float]:
         meters[name].start()
-        drawn[name] = renderers[name](scene)
+        renderings[name] = renderers[name](scene)
         meters[name].stop()
         advance()
         return {"seconds": meters[name].seconds[-1]}
 
     once = runs_once(base)
-    if once:  # compiles kernels
+    if once:  # a step to warm up, which compiles the kernels
         replace(base, seconds=None, steps=1).prepare(refinement, CPU)(scene)
     for name in settings:
         try:
@@ -354,7 +382,7 @@ def _measure_scene(
             absent[name] = str(error)
     if not once:
         timing.time_in_rounds(list(measurements.values()), repeats)
-    exact_images = {repr(base): drawn[BASE].images}
+    exact_images = {repr(base): renderings[BASE].images}
     rows = []
     for name, setting in settings.items():
         row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
@@ -363,8 +391,8 @@ def _measure_scene(
         if name in measurements:
             seconds, base_seconds = (measurements[n].seconds["seconds"] for n in (name, BASE))
             ratios = [a / b for a, b in zip(seconds, base_seconds, strict=True)]
-            row |= {"seconds": summary(seconds), "over_base": summary(ratios)}
-            row["gaussians"] = drawn[name].gaussians
+            row |= {"seconds": summarize(seconds), "over_base": summarize(ratios)}
+            row["gaussians"] = renderings[name].num_gaussians
             row["peak_gb"] = max(meters[name].gb, default=None)
             exact = base
             if isinstance(setting, FeedForward):
@@ -373,42 +401,44 @@ def _measure_scene(
                 key = repr(exact)
                 if key not in exact_images:
                     exact_images[key] = exact.prepare(refinement, device)(scene).images
-                row["error"] = {"decibels": decibels(drawn[name].images, exact_images[key])}
+                row["error"] = {
+                    "decibels": measure_psnr(renderings[name].images, exact_images[key])
+                }
             if setting.trained:
-                metrics = protocol.image_metrics(drawn[name].images, scene.held_out, lpips)
+                metrics = protocol.image_metrics(renderings[name].images, scene.held_out, lpips)
                 row |= {metric: values.mean().item() for metric, values in metrics.items()}
         rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
     return rows
 
 
 def runs_once(base: Setting) -> bool:
-    """Return whether the settings of this base have a limit in seconds."""
+    """Return whether this base, and so each variant, runs once: its limit is in seconds."""
     return isinstance(base, Refined) and base.seconds is not None
 
 
 def count_runs(settings: Mapping[str, Setting], repeats: int) -> int:
-    """Count the runs of all settings on a scene: once, or also in a warm-up and the rounds."""
+    """Count the runs of all settings on a scene: one each, or a trial, a warm-up and the rounds."""
     return len(settings) * (1 if runs_once(settings[BASE]) else 2 + repeats)
 
 
-def decibels(image: Tensor, exact: Tensor) -> float:
-    """Compare images, clamped to [0, 1], by the decibels of their mean squared error."""
+def measure_psnr(image: Tensor, exact: Tensor) -> float:
+    """Return the PSNR of all images together, clamped to [0, 1], in dB."""
     error = image.double().clamp(0, 1) - exact.double().clamp(0, 1)
     return -10 * error.square().mean().clamp_min(MIN_SQUARED_ERROR).log10().item()
 
 
 def measure(options: DictConfig, console: Console) -> Result:
-    """Render the held-out views of `options.pareto.scenes` with every variant.
+    """Render the held-out views of `options.pareto.scenes` with every setting.
 
-    All settings of a family take turns on a scene, in `options.repeats` rounds; those of seconds
-    run once.
+    The settings of a family take turns on a scene, in `options.repeats` rounds; those with a limit
+    in seconds run once.
 
     Returns:
-        "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
-        same round "over_base", "error" of the images against the exact ones in "decibels", and
-        metrics against the photographs, the number of "gaussians", and "peak_gb", the largest
-        `peak_memory_gb` of all runs; None for what was not measured.
-        "not_measured": what, and why.
+        "rows": one for each family, scene and setting, with None for what was not measured.
+        "seconds", and "over_base", their ratio to those of the base in the same round; "error", the
+        "decibels" of the images against the exact ones; the metrics against the photographs;
+        "gaussians", their number; "peak_gb", the largest peak memory of all runs.
+        "not_measured": the reason for everything that was not measured.
     """
     config = OmegaConf.to_container(options.pareto, resolve=True)
     shared = Path(config["shared"])
@@ -447,12 +477,13 @@ def measure(options: DictConfig, console: Console) -> Result:
     return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}
 
 
-def summarize(rows: Sequence[Result]) -> list[Result]:
-    """Average each setting of each family over the scenes that it was measured on.
+def average_scenes(rows: Sequence[Result]) -> list[Result]:
+    """Average each setting of each family over the scenes on which it was measured.
 
     Returns:
-        "over_base" is a geometric mean; "lost" is the PSNR below the base's; "busy" whether some
-        scene was measured on a busy machine. None for what was measured on no scene.
+        Rows with the means, None for what was measured on no scene. "over_base" is a geometric
+        mean; "lost" is the PSNR of the base minus that of the setting; "busy" is True if the
+        machine was busy on any scene.
     """
     bases = {(row["family"], row["scene"]): row for row in rows if row["setting"] == BASE}
     means = []
@@ -484,19 +515,19 @@ def _grouped(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[
 
 
 def tables(results: Result) -> list[Table]:
-    """Show each scene's settings, then the means over scenes of each family."""
+    """Show the settings of each family on each scene, then their means over the scenes."""
     absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
     notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
     scenes = _grouped(results["rows"], "family", "scene").items()
     shown = [make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes]
-    for (name,), rows in _grouped(summarize(results["rows"]), "family").items():
+    for (name,), rows in _grouped(average_scenes(results["rows"]), "family").items():
         shown.append(make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes))
     return shown
 
 
 def plot(results: Result) -> Figure:
-    """Plot the means of each family: PSNR, or the error where there is none, against seconds."""
-    families = _grouped(summarize(results["rows"]), "family")
+    """Plot the mean PSNR of each family, or its error if untrained, against mean seconds."""
+    families = _grouped(average_scenes(results["rows"]), "family")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(1.0 + 5.2 * len(families), 5.0), layout="constrained")
         grid = figure.subplots(1, len(families), squeeze=False)[0]
@@ -516,23 +547,23 @@ def plot(results: Result) -> Figure:
 
 
 ROWS: Columns = {
-    "setting": text("{setting}"),
+    "setting": text_column("{setting}"),
     "ms": median_iqr_column("seconds"),
     "/ base": median_iqr_column("over_base", "{:.2f}", unit=1.0),
-    "PSNR": number("psnr", "{:.2f}"),
-    "LPIPS": number("lpips", "{:.3f}"),
-    "Gaussians": number("gaussians", "{:,}"),
-    "GB": number("peak_gb", "{:.2f}"),
-    "error\ndB": number("error.decibels", "{:.1f}"),
+    "PSNR": number_column("psnr", "{:.2f}"),
+    "LPIPS": number_column("lpips", "{:.3f}"),
+    "Gaussians": number_column("gaussians", "{:,}"),
+    "GB": number_column("peak_gb", "{:.2f}"),
+    "error\ndB": number_column("error.decibels", "{:.1f}"),
 }
 MEANS: Columns = {
-    "setting": text("{setting}"),
-    "scenes": text("{scenes}"),
-    "ms": number("seconds", "{:.0f}", unit=1e-3),
+    "setting": text_column("{setting}"),
+    "scenes": text_column("{scenes}"),
+    "ms": number_column("seconds", "{:.0f}", unit=1e-3),
     "": lambda row: "busy" if row["busy"] else "",
-    "/ base": number("over_base", "{:.2f}"),
-    "PSNR": number("psnr", "{:.2f}"),
-    "PSNR\nlost": number("lost", "{:+.2f}"),
-    "LPIPS": number("lpips", "{:.3f}"),
-    "error\ndB": number("error", "{:.1f}"),
+    "/ base": number_column("over_base", "{:.2f}"),
+    "PSNR": number_column("psnr", "{:.2f}"),
+    "PSNR\nlost": number_column("lost", "{:+.2f}"),
+    "LPIPS": number_column("lpips", "{:.3f}"),
+    "error\ndB": number_column("error", "{:.1f}"),
 }

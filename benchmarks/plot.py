@@ -1,4 +1,4 @@
-"""The figures of the suites: time against error, and bars."""
+"""Figures of the suites: time against error, and bars."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from asysplat.report.style import FAINT, INK, OURS, STYLE
-from benchmarks.table import worst
+from benchmarks.table import largest_at
 from benchmarks.timing import Result
 
 COLORS = {"cpu": OURS, "cuda": INK, "reference": FAINT}
@@ -15,9 +15,9 @@ MARKS = "osD^vPX*"
 
 
 def time_against_error(rows: Sequence[Result], errors: Mapping[str, tuple[str, str]]) -> Figure:
-    """Plot a point for each row, colored by its "backend", marked by its "scene".
+    """Plot a point for each row; its color is its "backend", its marker its "scene".
 
-    `errors` has, for each timed pass, the label of its error and the error's path in a row.
+    `errors` maps each timed pass to the label of its error, and to the path of this error in a row.
     """
     shared = {"ls": "", "ms": 8, "alpha": 0.8}
     marks = dict(zip(dict.fromkeys(row["scene"] for row in rows), MARKS, strict=False))
@@ -26,7 +26,7 @@ def time_against_error(rows: Sequence[Result], errors: Mapping[str, tuple[str, s
         for axes, (name, (label, path)) in zip(figure.subplots(1, 2), errors.items(), strict=True):
             for row in rows:
                 style = {"marker": marks[row["scene"]], "color": COLORS[row["backend"]], **shared}
-                axes.plot(1000 * row[name]["median"], worst(row, path), **style)
+                axes.plot(1000 * row[name]["median"], largest_at(row, path), **style)
             axes.set(title=name, xlabel="milliseconds", xscale="log", yscale="log", ylabel=label)
             axes.margins(0.15)
             for axis in (axes.xaxis, axes.yaxis):
@@ -45,11 +45,11 @@ def bars(
     label: str,
     tolerance: float | None = None,
 ) -> Figure:
-    """Plot a horizontal bar for each name, made of parts, and a line at a tolerance.
+    """Plot a horizontal bar for each name, stacked from parts, and a line at the tolerance, if any.
 
     Args:
-        parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
-        label: label of the lengths.
+        parts: lengths of each part, one for each bar; parts of length 0 everywhere are left out.
+        label: label of the axis of lengths.
     """
     colors = matplotlib.colormaps["tab10"].colors
     with matplotlib.rc_context(STYLE):

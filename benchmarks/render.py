@@ -1,4 +1,4 @@
-"""Every backend of the renderer, and every culling switched off: seconds, memory, error."""
+"""Every backend of the renderer, with all culling and without each kind: seconds and error."""
 
 from dataclasses import fields
 from functools import partial
@@ -17,47 +17,54 @@ from asysplat.rendering import render
 from asysplat.rendering.interface import Culling, without_culling
 from asysplat.scene import Cameras, Gaussians
 from benchmarks import timing
-from benchmarks.compare import ERROR, TIME, Watched
+from benchmarks.compare import ERROR, TIME, TrackedMetrics
 from benchmarks.options import CPU, check_names
 from benchmarks.plot import time_against_error
 from benchmarks.scenes import SCENES, SMALLER, Scene
-from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
+from benchmarks.table import (
+    error_column,
+    machine_note,
+    make_table,
+    median_iqr_column,
+    number_column,
+    text_column,
+)
 from benchmarks.timing import Measurement, Result, device_time, relative_l2
 
-WATCHED = Watched(
+TRACKED = TrackedMetrics(
     names=("scene", "backend", "without"),
-    alike=("gaussians", "views", "height", "width", "error.measured_on"),
+    must_match=("gaussians", "views", "height", "width", "error.measured_on"),
     kinds=dict.fromkeys(("forward", "backward"), TIME)
     | dict.fromkeys(("error.image_p99", "error.image_max", "error.gradients"), ERROR),
 )
 CULLING = tuple(field.name for field in fields(Culling))
 FIELDS = tuple(field.name for field in fields(Gaussians))
-FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
+FLIP = 1e-4  # more than rounding alone changes a color; a flipped cut-off changes up to 1/255
 PASSES = ("forward", "backward")
 
 
 class Backend(NamedTuple):
-    """A renderer."""
+    """A backend of the renderer."""
 
     name: str
     device: torch.device = CPU  # device of its tensors
-    culling: tuple[str, ...] = ()  # names of the culling that can be switched off
+    culling: tuple[str, ...] = ()  # kinds of culling that can be switched off
 
 
-Inputs = tuple[Gaussians, Cameras, Tensor]  # see `prepare`
+Inputs = tuple[Gaussians, Cameras, Tensor]  # see `prepare_inputs`
 
 
 class Outputs(NamedTuple):
-    """The results of both passes."""
+    """The results of a forward and a backward pass."""
 
     image: Tensor  # [V, 3, H, W]
-    gradients: tuple[Tensor, ...]  # gradients of FIELDS, in that order
+    gradients: tuple[Tensor, ...]  # in the order of FIELDS
     seconds: dict[str, float]  # durations of "forward" and "backward"
     stats: dict[str, int]
 
 
 def find_backends() -> list[Backend]:
-    """List the reference, then the fast backends that can run here."""
+    """List the reference, then the fast backends that this machine can run."""
     backends = [Backend("reference"), Backend("cpu", culling=CULLING)]
     if torch.cuda.is_available():
         without_rows = tuple(name for name in CULLING if name != "rows")
@@ -65,12 +72,14 @@ def find_backends() -> list[Backend]:
     return backends
 
 
-def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = None) -> Inputs:
-    """Move a scene to a device.
+def prepare_inputs(
+    scene: Scene, device: torch.device = CPU, ignored: Tensor | None = None
+) -> Inputs:
+    """Make the inputs of `run_passes` on a device.
 
     Returns:
-        Gaussians that require gradients, cameras, and the gradient of the image [V, 3, H, W],
-        from a normal distribution: the same at every call, but for 0 at the pixels `ignored`,
+        Gaussians that require gradients, cameras, and the gradient of the image [V, 3, H, W]: drawn
+        from a normal distribution, the same at every call, and 0 at the pixels `ignored`
         [V, H, W].
     """
     gaussians, cameras = (part.to(device) for part in scene)
@@ -82,8 +91,8 @@ def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = N
     return leaves, cameras, weights.to(gaussians.means)
 
 
-def run(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
-    """Render without background and the culling that is `off`, and compute the gradients."""
+def run_passes(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
+    """Render without background, with the kinds of culling `off` switched off; differentiate."""
     gaussians, cameras, weights = inputs
     leaves = [getattr(gaussians, name) for name in FIELDS]
     start = device_time(backend.device)
@@ -96,20 +105,22 @@ def run(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
 
 
 def run_exact(scene: Scene, ignored: Tensor | None = None) -> Outputs:
-    """Render the scene by the reference in float64."""
+    """Run both passes of the reference in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
-    return run(Backend("reference"), prepare(exact, ignored=ignored))
+    return run_passes(Backend("reference"), prepare_inputs(exact, ignored=ignored))
 
 
-def flips(outputs: Outputs, exact: Outputs) -> Tensor:
-    """Find the pixels [V, H, W] at which rounding decided otherwise at a cut-off."""
+def find_flips(outputs: Outputs, exact: Outputs) -> Tensor:
+    """Return a mask [V, H, W] of the pixels where rounding flipped a decision at a cut-off."""
     return ((outputs.image.cpu().double() - exact.image).abs() > FLIP).any(1)
 
 
-def errors(outputs: Outputs, exact: Outputs, ignored: Tensor) -> Result:
-    """Compare images and gradients, in L2, outside the pixels `ignored`, [V, H, W].
+def measure_errors(outputs: Outputs, exact: Outputs, ignored: Tensor) -> Result:
+    """Compare image and gradients with exact ones that leave out the pixels `ignored` [V, H, W].
 
-    Returns also the fraction of these pixels, "flipped".
+    Returns:
+        "flipped": fraction of the pixels that are ignored; "image_max" and "image_p99": largest
+        difference of the image, and its 99th percentile; "gradients": relative L2 errors.
     """
     differences = (outputs.image.cpu().double() - exact.image).abs() * ~ignored[:, None]
     gradients = map(relative_l2, outputs.gradients, exact.gradients)
@@ -122,10 +133,10 @@ def errors(outputs: Outputs, exact: Outputs, ignored: Tensor) -> Result:
 
 
 def measure(options: DictConfig, console: Console) -> Result:
-    """Time every backend on the scenes `options.scenes`, `options.repeats` times.
+    """Time every backend on the scenes in `options.scenes`, `options.repeats` times.
 
     Returns:
-        "rows": one for each scene, backend and culling that is off, times in seconds.
+        "rows": one for each scene, backend and kind of culling that is off, with times in seconds.
     """
     names = list(SCENES) if options.scenes == "all" else options.scenes
     check_names("scenes", names, SCENES)
@@ -137,25 +148,25 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
     backends = find_backends()
     scene = SCENES[name]()
     small = SMALLER[name]() if name in SMALLER else scene
-    # Where the rounding of any backend decides about a cut-off, more than rounding differs.
+    # Where rounding flips a decision at a cut-off, results differ by more than rounding.
     exact = run_exact(small)
-    fast = [run(b, prepare(small, b.device)) for b in backends]
-    ignored = torch.stack([flips(outputs, exact) for outputs in fast]).any(0)
+    fast = [run_passes(b, prepare_inputs(small, b.device)) for b in backends]
+    ignored = torch.stack([find_flips(outputs, exact) for outputs in fast]).any(0)
     exact = run_exact(small, ignored)
     measurements = []
     for backend in backends:
-        inputs = prepare(scene, backend.device)
-        small_inputs = prepare(small, backend.device, ignored)
+        inputs = prepare_inputs(scene, backend.device)
+        small_inputs = prepare_inputs(small, backend.device, ignored)
         for off in (None, *backend.culling):
             kinds = [] if off is None else [off]
-            run_once = partial(run, backend, inputs, *kinds)
-            error = errors(run(backend, small_inputs, *kinds), exact, ignored)
+            run_once = partial(run_passes, backend, inputs, *kinds)
+            error = measure_errors(run_passes(backend, small_inputs, *kinds), exact, ignored)
             row = {"scene": name, "backend": backend.name, "without": off, **_sizes(scene)}
             row["error"] = {"measured_on": _sizes(small), **error}
             row["stats"] = run_once().stats
             measurements.append(Measurement(lambda run_once=run_once: run_once().seconds, row))
     timing.time_in_rounds(measurements, repeats)
-    return [m.row | {name: m.summary(name) for name in PASSES} for m in measurements]
+    return [m.row | {name: m.summarize(name) for name in PASSES} for m in measurements]
 
 
 def _sizes(scene: Scene) -> dict[str, int]:
@@ -165,27 +176,27 @@ def _sizes(scene: Scene) -> dict[str, int]:
 
 
 def tables(results: Result) -> list[Table]:
-    """Show all rows."""
+    """Show every backend with all culling, and without each kind."""
     notes = (
-        f"{machine_note(results)}; *: errors of a smaller scene of the same make;\n"
-        "errors outside the pixels where some backend's rounding decides otherwise at a cut-off"
+        f"{machine_note(results)}; *: errors of a smaller scene of the same kind;\n"
+        "errors: without the pixels where rounding in any backend flips a decision at a cut-off"
     )
     columns = {
-        "scene": text("{scene}"),
+        "scene": text_column("{scene}"),
         "backend": lambda r: f"  no {r['without']} culling" if r["without"] else r["backend"],
         "forward\nms": median_iqr_column("forward"),
         "backward\nms": median_iqr_column("backward"),
-        "image\np99": error("error.image_p99"),
-        "image\nmax": error("error.image_max"),
-        "flips\n1e-6": number("error.flipped", "{:.0f}", unit=1e-6),
-        "gradients\nworst": error("error.gradients"),
+        "image\np99": error_column("error.image_p99"),
+        "image\nmax": error_column("error.image_max"),
+        "flips\n1e-6": number_column("error.flipped", "{:.0f}", unit=1e-6),
+        "gradients\nworst": error_column("error.gradients"),
     }
     title = "Every backend, and without one kind of culling"
     return [make_table(title, columns, results["rows"], notes, names=2)]
 
 
 def plot(results: Result) -> Figure:
-    """Plot the forward and the backward pass of every backend with all its culling."""
+    """Plot time against error of both passes of every backend, with all culling."""
     labels = {
         "forward": ("image against float64, 99th percentile", "error.image_p99"),
         "backward": ("worst gradient against float64, relative L2", "error.gradients"),

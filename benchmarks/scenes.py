@@ -1,4 +1,4 @@
-"""Procedural scenes to measure renderers on: nothing to download, the same on every machine."""
+"""Procedural scenes to measure renderers on: nothing to download, equal on every machine."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,12 +12,12 @@ Sample = Callable[..., Tensor]
 Scene = tuple[Gaussians, Cameras]
 
 FOCAL = 0.9  # focal length, in image widths
-DISTANCE = 4.0  # from the camera to pixel-aligned Gaussians
-ARC = 0.5  # radians
+DISTANCE = 4.0  # typical distance from the camera to the scene; radius of the arc
+ARC = 0.5  # angle of the arc, in radians
 
 
 def random_numbers(seed: int) -> tuple[Sample, Sample]:
-    """Return functions that draw uniform and normal numbers of a shape in float64."""
+    """Return two functions of a shape, which draw uniform and normal numbers in float64."""
     options = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
     return partial(torch.rand, **options), partial(torch.randn, **options)
 
@@ -29,10 +29,10 @@ def camera_at_origin(focal: float, height: int, width: int) -> Cameras:
 
 
 def random_scene(count: int, height: int, width: int, seed: int = 0) -> Scene:
-    """Scatter `count` Gaussians over the image and 10 % beyond it, and over depths.
+    """Scatter `count` Gaussians over the image, a margin of 10 % around it, and depths of 2 to 10.
 
-    Positions are uniform, depths uniform in 2 to 10, deviations log-normal (median 2 pixels, 0.6)
-    per axis, opacities uniform in .05 to .95.
+    Positions and depths are uniform, standard deviations log-normal along each axis (median 2
+    pixels, sigma 0.6), opacities uniform in 0.05 to 0.95.
 
     Returns:
         Gaussians [N] of SH degree 0, and one camera; float32.
@@ -48,8 +48,8 @@ def random_scene(count: int, height: int, width: int, seed: int = 0) -> Scene:
 def pixel_aligned_scene(side: int, height: int, width: int, seed: int = 0) -> Scene:
     """Imitate what networks predict: two jittered grids of side x side Gaussians over the image.
 
-    Depths are smooth and near 4, deviations log-normal (median 0.8 width / side pixels, 0.4),
-    opacities sigmoid(2 N(0, 1)); in the order of the pixels.
+    The Gaussians are in the order of the pixels. Depths are smooth and near 4, standard deviations
+    log-normal (median 0.8 width / side pixels, sigma 0.4), opacities sigmoid(2 N(0, 1)).
 
     Returns:
         Gaussians [2 side^2] of SH degree 0, and one camera; float32.
@@ -66,8 +66,8 @@ def pixel_aligned_scene(side: int, height: int, width: int, seed: int = 0) -> Sc
     return _scene(position, depths, sigma, opacities, (height, width), normal)
 
 
-def on_an_arc(camera: Cameras, views: int) -> Cameras:
-    """Copy a camera to `views` positions on an arc of ARC radians about a point at DISTANCE."""
+def place_on_arc(camera: Cameras, views: int) -> Cameras:
+    """Copy a camera to `views` poses on an arc of ARC radians, around the point DISTANCE ahead."""
     angles = torch.linspace(-ARC / 2, ARC / 2, views)
     turns = torch.zeros(views, 4, 4)
     turns[:, 0, 0] = turns[:, 2, 2] = angles.cos()
@@ -87,9 +87,14 @@ def _scene(
     size: tuple[int, int],
     normal: Sample,
 ) -> Scene:
-    """Make a camera of height and width `size`, and Gaussians that project to `position`.
+    """Make a camera, and Gaussians that project to given positions.
 
-    Positions are in fractions of the image, deviations `sigma` in pixels.
+    Args:
+        position: positions in the image, as fractions of its width and height.
+        depths: depth of each Gaussian.
+        sigma: standard deviations in pixels.
+        size: height and width of the image.
+        normal: source of the orientations and colors.
     """
     height, width = size
     focal = FOCAL * width
@@ -106,7 +111,7 @@ def _scene(
 
 def _scene_on_an_arc(views: int) -> Scene:
     gaussians, camera = pixel_aligned_scene(256, 256, 256)
-    return gaussians, on_an_arc(camera, views)
+    return gaussians, place_on_arc(camera, views)
 
 
 SCENES = {
@@ -117,7 +122,7 @@ SCENES = {
     "4M": partial(pixel_aligned_scene, 1414, 540, 960),
     "131kx16": partial(_scene_on_an_arc, 16),
 }
-SMALLER = {  # scenes that float64 can afford: errors are measured on these instead
+SMALLER = {  # scenes on which errors are measured instead: float64 takes too long on the large ones
     "4M": partial(pixel_aligned_scene, 354, 135, 240),
     "131kx16": partial(_scene_on_an_arc, 2),
 }

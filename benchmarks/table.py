@@ -16,16 +16,16 @@ from asysplat.files import atomic_write
 from asysplat.report.markdown import escape
 from benchmarks.timing import BUSY, Result
 
-NOTHING = "-"  # for what was not measured
-WIDTH = 100  # characters of a line of JSON, above which a dictionary or list is split
-Write = Callable[[Result], str]
-Columns = Mapping[str, Write]
+NOT_MEASURED = "-"
+WIDTH = 100  # a dictionary or list that is longer as one line of JSON is split
+WriteCell = Callable[[Result], str]
+Columns = Mapping[str, WriteCell]
 
 
 def make_table(
     title: str, columns: Columns, rows: Sequence[Result], notes: str | None = None, names: int = 1
 ) -> Table:
-    """Make a table with a line for each row; the first `names` columns hold words."""
+    """Make a table with a line for each row; its first `names` columns are aligned left."""
     table = Table(title=title, caption=notes, box=ROUNDED)
     for number, heading in enumerate(columns):
         table.add_column(heading, justify="left" if number < names else "right", no_wrap=True)
@@ -34,14 +34,19 @@ def make_table(
     return table
 
 
+def machine_text(results: Result) -> str:
+    """Write the machine that the results were measured on, and the versions of packages."""
+    return ", ".join(f"{key} {value}" for key, value in results["machine"].items())
+
+
 def machine_note(results: Result) -> str:
-    """Write the note that every suite begins with: the machine, and the meaning of ±."""
-    machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
-    return f"{machine}\nmedian ± interquartile range; busy: that is over {BUSY:.0%} of the median"
+    """Write the first lines of every suite's notes: the machine, and the meaning of ±."""
+    busy = f"busy: the range exceeds {BUSY:.0%} of the median"
+    return f"{machine_text(results)}\nmedian ± interquartile range; {busy}"
 
 
-def markdown(table: Table) -> str:
-    """Write a table as GitHub Markdown, its title above and its notes below."""
+def format_markdown(table: Table) -> str:
+    """Write a table as GitHub Markdown, with its title above and its notes below."""
     headings = [" ".join(str(column.header).split()) for column in table.columns]
     rules = [":--" if column.justify == "left" else "--:" for column in table.columns]
     cells = [list(map(str, column.cells)) for column in table.columns]
@@ -51,56 +56,64 @@ def markdown(table: Table) -> str:
     return "\n".join([f"## {escape(str(table.title))}", "", *lines, "", *notes]) + "\n"
 
 
-def at(row: Result, path: str) -> Any:
-    """Return row["a"]["b"] for the path "a.b"; None where there is no such value."""
+def value_at(row: Result, path: str) -> Any:
+    """Return row["a"]["b"] for the path "a.b", or None if there is no such value."""
     for key in path.split("."):
         row = row.get(key) if row else None
     return row
 
 
-def worst(row: Result, path: str) -> float:
-    """Return the number at a path; of several numbers, the largest."""
-    value = at(row, path)
+def largest_at(row: Result, path: str) -> float:
+    """Return the number at a path, or the largest of a dictionary of numbers."""
+    value = value_at(row, path)
     return max(value.values()) if isinstance(value, Mapping) else value
 
 
-def text(pattern: str) -> Write:
-    """Write the values that a pattern such as "{views} views" names."""
+def text_column(pattern: str) -> WriteCell:
+    """Return a function that fills a pattern such as "{views} views" with a row's values."""
     return lambda row: pattern.format(**row)
 
 
-def number(path: str, pattern: str, unit: float = 1.0) -> Write:
-    """Write a number, divided by its unit."""
-    return lambda row: NOTHING if at(row, path) is None else pattern.format(at(row, path) / unit)
-
-
-def median_iqr_column(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
-    """Write median ± interquartile range, and "busy" where that is wide; seconds in ms."""
+def number_column(path: str, pattern: str, unit: float = 1.0) -> WriteCell:
+    """Return a function that writes the number at a path, divided by `unit`."""
 
     def write(row: Result) -> str:
-        if (value := at(row, path)) is None:
-            return NOTHING
+        value = value_at(row, path)
+        return NOT_MEASURED if value is None else pattern.format(value / unit)
+
+    return write
+
+
+def median_iqr_column(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> WriteCell:
+    """Return a function that writes median ± interquartile range, and "busy" where it is wide.
+
+    Both are divided by `unit`; by default, seconds are written in milliseconds.
+    """
+
+    def write(row: Result) -> str:
+        if (value := value_at(row, path)) is None:
+            return NOT_MEASURED
         words = " ± ".join(pattern.format(value[name] / unit) for name in ("median", "iqr"))
         return f"{words} busy" if value["iqr"] > BUSY * value["median"] else words
 
     return write
 
 
-def error(path: str) -> Write:
-    """Write an error, with a * where it was measured on a smaller case."""
+def error_column(path: str) -> WriteCell:
+    """Return a function that writes an error, with a * where a smaller case was measured."""
 
     def write(row: Result) -> str:
         if row["error"] is None:
-            return NOTHING
-        sizes, own_sizes = row["error"]["measured_on"], row.get("sizes", row)
-        smaller = any(own_sizes[key] != size for key, size in sizes.items())
-        return f"{worst(row, path):.1e}{'*' if smaller else ''}"
+            return NOT_MEASURED
+        measured_sizes, row_sizes = row["error"]["measured_on"], row.get("sizes", row)
+        smaller = any(row_sizes[key] != size for key, size in measured_sizes.items())
+        return f"{largest_at(row, path):.1e}{'*' if smaller else ''}"
 
     return write
 
 
-def dumps(value: Any, indent: str = "") -> str:
-    """Write JSON with each row of a list, and each dictionary of plain values, on one line.
+def format_json(value: Any, indent: str = "") -> str:
+    """Write JSON in which each row of a list, and each dictionary of plain values, is one line.
 
     Raises:
         ValueError: a number is NaN or infinite.
@@ -112,20 +125,20 @@ def dumps(value: Any, indent: str = "") -> str:
     if isinstance(value, list):
         rows = [f"{indent} {json.dumps(row)}" for row in value]
         return "\n".join(["[", ",\n".join(rows), f"{indent}]"])
-    rows = [f"{indent} {json.dumps(k)}: {dumps(v, indent + ' ')}" for k, v in value.items()]
+    rows = [f"{indent} {json.dumps(k)}: {format_json(v, indent + ' ')}" for k, v in value.items()]
     return "\n".join(["{", ",\n".join(rows), f"{indent}}}"])
 
 
 def write_results(
     results: Result, tables: Sequence[Table], figure: Figure | None, path: Path
 ) -> list[Path]:
-    """Write <path>.json, <path>.md and, of a figure, <path>.png; return their paths.
+    """Write <path>.json, <path>.md and, if there is a figure, <path>.png; return their paths.
 
     Raises:
         InputError: a file cannot be written.
         ValueError: a result is NaN or infinite.
     """
-    texts = {".json": dumps(results) + "\n", ".md": "\n".join(map(markdown, tables))}
+    texts = {".json": format_json(results) + "\n", ".md": "\n".join(map(format_markdown, tables))}
     path.parent.mkdir(parents=True, exist_ok=True)
     for suffix, content in texts.items():
         with atomic_write(path.with_suffix(suffix)) as partial:

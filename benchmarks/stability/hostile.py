@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from asysplat.scene import Cameras, Gaussians, Views
-from benchmarks.scenes import FOCAL, on_an_arc, random_numbers
+from benchmarks.scenes import FOCAL, place_on_arc, random_numbers
 
-SPACING = 1000.0  # between cameras that are kilometers apart; the unit is a meter
-MANY = 8  # more views have half as many pixels along a side, to save time
-NUM_GAUSSIANS = 240  # about
+SPACING = 1000.0  # distance between cameras that are "kilometers apart", in meters
+MANY = 8  # scenes of more views have half as many pixels along a side, to save time
+NUM_GAUSSIANS = 240  # rounded up to a multiple of the number of cameras
 FIELDS = tuple(field.name for field in fields(Gaussians))
 IMAGES = {"black": (0.0,) * 3, "white": (1.0,) * 3, "one color": (0.8, 0.1, 0.3), "noise": None}
 FOCALS = {"fisheye-like": 0.15, "wide": 0.4, "telescopic": 50.0}  # in image widths
@@ -20,20 +20,20 @@ FOCALS = {"fisheye-like": 0.15, "wide": 0.4, "telescopic": 50.0}  # in image wid
 
 @dataclass(frozen=True)
 class HostileViews:
-    """Views with one or more hostile properties."""
+    """The properties of a scene's views, of which one or more may be hostile."""
 
-    images: str = "noise"  # one of IMAGES
-    poses: str = "on an arc"  # one of POSES
+    images: str = "noise"  # key of IMAGES
+    poses: str = "on an arc"  # key of POSES
     focal: float = FOCAL  # focal length, in image widths
     count: int = 4  # views
     side: int = 32  # pixels along each side
 
     def views(self) -> Views:
-        """Make the views [V] of a scene, float32; the same numbers at every call."""
+        """Make the views [V] in float32; the same numbers at every call."""
         return Views(self.cameras(), make_images(self.images, self.count, self.side))
 
     def cameras(self) -> Cameras:
-        """Make only the cameras."""
+        """Make the cameras [V] of these views."""
         pixels, middle = self.focal * self.side, self.side / 2
         pinhole = torch.tensor([[pixels, 0, middle], [0, pixels, middle], [0, 0, 1]])
         camera = Cameras(pinhole[None], torch.eye(4)[None], self.side, self.side)
@@ -41,7 +41,11 @@ class HostileViews:
 
 
 def hostile_views(counts: Sequence[int] = ()) -> dict[str, HostileViews]:
-    """Change one property of the default views at a time, to each hostile value."""
+    """Return the default views with one property at a time changed to each hostile value.
+
+    Args:
+        counts: numbers of views to include.
+    """
     base = HostileViews()
     cases = {f"{name} photographs": replace(base, images=name) for name in IMAGES}
     cases |= {f"poses {name}": replace(base, poses=name) for name in POSES if name != base.poses}
@@ -53,7 +57,7 @@ def hostile_views(counts: Sequence[int] = ()) -> dict[str, HostileViews]:
 
 
 def make_images(kind: str, count: int, side: int) -> Tensor:
-    """Make images [count, 3, side, side] of one of IMAGES."""
+    """Make images [count, 3, side, side] of a kind in IMAGES."""
     if IMAGES[kind] is None:
         return torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(0))
     return torch.tensor(IMAGES[kind])[:, None, None].expand(count, 3, side, side).clone()
@@ -74,8 +78,8 @@ def _upside_down(camera: Cameras, count: int) -> Cameras:
 
 
 def _handheld(camera: Cameras, count: int) -> Cameras:
-    """Jitter cameras on an arc: at equal distances rounding would choose the neighbors."""
-    cameras = on_an_arc(camera, count)
+    """Jitter cameras on an arc: if their distances were equal, rounding would choose neighbors."""
+    cameras = place_on_arc(camera, count)
     poses = cameras.cam_to_world.clone()
     poses[:, :3, 3] += 0.02 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     return replace(cameras, cam_to_world=poses)
@@ -93,7 +97,8 @@ POSES: dict[str, Callable[[Cameras, int], Cameras]] = {
 def scattered_gaussians(cameras: Cameras) -> Gaussians:
     """Scatter NUM_GAUSSIANS over the images of all cameras and over depths of 2 to 10.
 
-    Their deviations are log-normal about two pixels, their opacities uniform in .05 to .95.
+    Their standard deviations are log-normal with a median of two pixels, their opacities uniform in
+    0.05 to 0.95.
     """
     uniform, normal = random_numbers(0)
     views = cameras.num_views
@@ -114,19 +119,19 @@ def scattered_gaussians(cameras: Cameras) -> Gaussians:
 
 
 def hostile_gaussians(name: str, gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Change Gaussians in the way `name`, one of HOSTILE_GAUSSIANS."""
+    """Make Gaussians hostile in the way that `name`, a key of HOSTILE_GAUSSIANS, says."""
     return replace(gaussians, **HOSTILE_GAUSSIANS[name](gaussians, cameras))
 
 
 def _behind(gaussians: Gaussians, cameras: Cameras) -> dict[str, Tensor]:
-    """Mirror half of the means at the first camera, and move some into it."""
+    """Mirror half of the means behind the first camera, and move a tenth into it."""
     means = gaussians.means.clone()
     means[::2] = 2 * cameras.centers[0] - means[::2]
     means[::10] = cameras.centers[0]
     return {"means": means}
 
 
-# The changed fields.
+# Each function returns the changed fields.
 HOSTILE_GAUSSIANS: dict[str, Callable[[Gaussians, Cameras], dict[str, Tensor]]] = {
     "tiny": lambda g, _: {"scales": g.scales * 1e-8},
     "huge": lambda g, _: {"scales": g.scales * 1e4},

@@ -23,22 +23,23 @@ from benchmarks.stability.hostile import FIELDS, HostileViews, hostile_views
 from benchmarks.timing import Result
 
 MIN_INVERSE_DEPTH = 1e-30  # avoids division by 0 where the plane sweep finds nothing
-WILD, WILD_FACTOR = "wild weights", 1e4  # factor of the decoder, as after a failed training
-# Views for 16 bits.
+# Weights of the decoder are multiplied by this factor, as after a failed training
+WILD, WILD_FACTOR = "wild weights", 1e4
+# Hostile views that are measured in half precision too
 HALF = ("black photographs", "noise photographs", "poses kilometers apart")
 HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
-# Roundings in sequence, of the 3,600 operations that round in both passes of the laptop's
-# network; in half precision only products round.
+# Roundings in sequence: fewer than the 3,600 operations that round in both passes of the network at
+# laptop scale. In half precision only products round, so that ROUNDINGS suffice.
 NETWORK_ROUNDINGS = 1024
 
 
 def depth_cases(plane_sweep: bool, counts: Sequence[int] = ()) -> list[StabilityCase]:
-    """List the cases of the plane sweep or of the prior, also for these numbers of views."""
+    """List the cases of the plane sweep or of the prior; `counts` are numbers of views."""
     prefix, function = ("plane_sweep, ", _plane_sweep) if plane_sweep else ("", _prior)
 
     def measure(hostile: HostileViews) -> Result:
         tensors = _tensors(hostile.views())
-        # In the order in which they are perturbed
+        # The order decides which random numbers perturb each tensor
         inputs = {name: tensors[name][None] for name in ("images", "intrinsics", "cam_to_world")}
         return compare_to_reference(function, function, inputs, magnitude=1.0)
 
@@ -58,7 +59,7 @@ def _cameras(tensors: Tensors) -> Cameras:
 
 
 def _plane_sweep(tensors: Tensors) -> Tensors:
-    """Compute confidence, and inverse depth over its maximum, weighted by confidence."""
+    """Compute the confidence, and the product of confidence and normalized inverse depth."""
     depth = plane_sweep(tensors["images"], _cameras(tensors))
     inverse = depth.inverse_depth / depth.inverse_depth.max().clamp_min(MIN_INVERSE_DEPTH)
     weighted = depth.confidence * inverse
@@ -78,9 +79,12 @@ def _prior(tensors: Tensors) -> Tensors:
 def network_cases(
     models: Sequence[str], overrides: Mapping[str, object], counts: Sequence[int]
 ) -> Iterator[StabilityCase]:
-    """Yield the cases of each of `models`, files of conf/model, at these numbers of views.
+    """Yield the cases of each network.
 
-    `overrides` are of train.py.
+    Args:
+        models: files of conf/model.
+        overrides: overrides of train.py.
+        counts: numbers of views.
     """
     for model in models:
         net, _ = make_net(model, overrides, torch.device("cpu"))
@@ -94,11 +98,11 @@ def network_cases(
 
 
 def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: bool) -> Result:
-    """Compare with the same network in float64; in fp16 without gradients, which underflow."""
+    """Compare a network with itself in float64; without gradients in fp16, where they underflow."""
     views, net = hostile.views(), copy.deepcopy(net).eval()
     if net.prior is not None:
-        # Computed once: the plane of the lowest cost is a discrete choice, so that another
-        # precision's prior would be another input.
+        # Computed once, for both precisions: the plane of lowest cost is a discrete choice, which
+        # rounding may flip.
         size = (hostile.side // net.head.stride,) * 2
         prior = net.prior(views.map(lambda tensor: tensor[None]), size)
         del net.prior
@@ -116,8 +120,8 @@ def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: 
         return {name: getattr(gaussians, name) for name in FIELDS}
 
     double = copy.deepcopy(net).double()
-    # The flag of the network alone, whose layers stay as they are: in training it does not validate
-    # its views, and a perturbed white exceeds 1.
+    # Set without the layers' flags: in training, the network does not validate its views, in which
+    # a perturbed white exceeds 1.
     double.training = True
     return compare_to_reference(
         partial(predict, net, half),

@@ -18,23 +18,23 @@ from benchmarks.stability.comparison import (
 from benchmarks.stability.hostile import IMAGES, make_images
 from benchmarks.timing import Result
 
-HUGE = 1e18  # its square is still a float32
+HUGE = 1e18  # its square is still finite in float32
 ALWAYS_FP32 = ("dt", "A", "D")  # inputs of a scan
-LENGTH, STATE = 131, 5  # tokens: more than two chunks, and no whole number of them
-TOKEN = {"ssd": (3, 4), "selective_scan": (6,)}  # heads and head_dim, or channels
-# Sizes of dt and of -A: similar; very different; so large that a token forgets all.
+LENGTH, STATE = 131, 5  # the number of tokens is more than two chunks, but not a multiple of one
+TOKEN = {"ssd": (3, 4), "selective_scan": (6,)}  # shape: heads and head_dim, or channels
+# Sizes of dt and of -A, as numbers or as "spread" over the range in SPREAD
 SCAN_SIZES = [("0.1", "1"), ("1e-8", "1"), ("1e3", "1"), ("0.1", "1e-4"), ("0.1", "1e4")]
 SCAN_SIZES += [("spread", "1"), ("spread", "spread")]
 SPREAD = {"dt": (1e-8, 1e3), "-A": (1e-4, 1e4)}
 ATTENTION_FACTORS = {"zero": 0.0, "noise": 1.0, "noise times 10": 10.0}
-MAPS = (1, 3, 4, 6, 2, 8)  # [B, V, h, w, H, P]
+MAPS = (1, 3, 4, 6, 2, 8)  # shape [B, V, h, w, H, P] of q, k and v
 SIDE = 24  # pixels of an image for the loss
 ADAM = AdamSettings(beta1=0.9, beta2=0.99, eps=1e-15)
 ADAM_STEPS, ROWS = 20, 50
 
 
 def operator_cases() -> Iterator[StabilityCase]:
-    """Yield the cases of all operators but the plane sweep, whose inputs are views."""
+    """Yield the cases of all operators except the plane sweep, whose inputs are views."""
 
     def case(name: str, precision: str, measure: Callable[..., Result], *args: object):
         run = partial(measure, *args, ALL_PRECISIONS[precision])

@@ -30,8 +30,8 @@ from benchmarks.stability.hostile import (
 from benchmarks.timing import Result
 
 SMALL = ("width=0.125", "state_size=8", "model.layers=1m1s")
-COUNTS = (1, 2, 4)  # numbers of views
-DEPTHS = (0.0, 1e-3, DISTANCE, 1e6)  # depths of all pixels; 0 is unknown
+COUNTS = (1, 2, 4)  # numbers of views in a batch
+DEPTHS = (0.0, 1e-3, DISTANCE, 1e6)  # a depth for all pixels; 0 is unknown
 
 
 def training_cases(models: Sequence[str], steps: int) -> Iterator[StabilityCase]:
@@ -44,7 +44,7 @@ def training_cases(models: Sequence[str], steps: int) -> Iterator[StabilityCase]
 
 
 def _measure_training(model: str, precision: str, steps: int) -> Result:
-    """Train as train.py does, without writing files; non-finite steps are dropped, as there."""
+    """Train as train.py does, but write no files; steps with non-finite gradients are skipped."""
     overrides = [f"model={model}", "scale=laptop", f"steps={steps}", *SMALL]
     config = hydra.compose("train", overrides)
     torch.manual_seed(0)
@@ -74,7 +74,7 @@ def _measure_training(model: str, precision: str, steps: int) -> Result:
 
 
 def hostile_batches(steps: int) -> Iterator[dict[str, Views]]:
-    """Yield `steps` batches of one scene, each of randomly chosen kinds."""
+    """Yield `steps` batches of one scene, with randomly chosen hostile properties."""
     kinds = list(product(IMAGES, POSES, FOCALS.values(), COUNTS))
     order = random.Random(0)
     for _ in range(steps):
@@ -93,7 +93,7 @@ def refinement_cases(steps: int) -> Iterator[StabilityCase]:
 
 
 def _measure_refinement(name: str, steps: int) -> Result:
-    """Refine hostile Gaussians to renderings of what they were before."""
+    """Refine hostile Gaussians against renderings of the Gaussians that they were made from."""
     cameras = HostileViews().cameras()
     gaussians = scattered_gaussians(cameras)
     views = Views(cameras, render(gaussians, cameras, depth=False).image.clamp(0, 1))

@@ -27,7 +27,7 @@ def renderer_cases(counts: Sequence[int]) -> Iterator[StabilityCase]:
     for name in HOSTILE_GAUSSIANS:
         yield StabilityCase(f"Gaussians {name}", "fp32", partial(measure, views, name))
     for name, hostile in hostile_views(counts).items():
-        if "photographs" not in name:  # the renderer does not use them
+        if "photographs" not in name:  # the renderer uses only the cameras
             yield StabilityCase(name, "fp32", partial(measure, hostile))
     for precision, dtype in (("bf16", torch.bfloat16), ("fp16", torch.float16)):
         run = partial(measure, views, dtype=dtype)
@@ -42,10 +42,13 @@ def measure(
 ) -> Result:
     """Compare images, alphas, depths and all gradients of a backend with the reference.
 
-    Pixels of the `boundary_band` are excluded: rounding may decide about a cut-off there.
+    Pixels of the `boundary_band` are excluded: rounding may flip a decision there.
 
     Args:
-        name: a key of HOSTILE_GAUSSIANS.
+        hostile: views whose cameras are rendered.
+        name: key of HOSTILE_GAUSSIANS; None for scattered Gaussians.
+        dtype: dtype of the Gaussians.
+        backend: backend under test.
     """
     cameras = hostile.cameras()
     gaussians = scattered_gaussians(cameras)

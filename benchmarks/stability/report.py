@@ -1,4 +1,4 @@
-"""The suite: measure every case, and show which are red."""
+"""The suite: measure every case, and show which ones are red."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -10,7 +10,7 @@ from rich.table import Table
 
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
-from benchmarks.compare import ERROR, Watched
+from benchmarks.compare import ERROR, TrackedMetrics
 from benchmarks.options import check_names
 from benchmarks.plot import bars
 from benchmarks.stability.comparison import RULE, StabilityCase
@@ -18,7 +18,14 @@ from benchmarks.stability.models import depth_cases, network_cases
 from benchmarks.stability.operators import operator_cases
 from benchmarks.stability.optimization import refinement_cases, training_cases
 from benchmarks.stability.renderer import renderer_cases
-from benchmarks.table import NOTHING, Columns, make_table, number, text
+from benchmarks.table import (
+    NOT_MEASURED,
+    Columns,
+    machine_text,
+    make_table,
+    number_column,
+    text_column,
+)
 from benchmarks.timing import Result
 
 AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
@@ -29,39 +36,38 @@ AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
     "training": lambda options: training_cases(options.models, options.training_steps),
     "refinement": lambda options: refinement_cases(options.refinement_steps),
 }
-WATCHED = Watched(names=("area", "case", "precision"), alike=(), kinds={"error": ERROR})
-
-
+TRACKED = TrackedMetrics(names=("area", "case", "precision"), must_match=(), kinds={"error": ERROR})
 COLUMNS: Columns = {
-    "case": text("{case}"),
-    "precision": text("{precision}"),
-    "worst": lambda row: row["worst"] or NOTHING,
-    "error": number("error", "{:.1e}"),
-    "tolerance": number("tolerance", "{:.1e}"),
-    "NaN": number("nan", "{:,.0f}"),
-    "Inf": number("inf", "{:,.0f}"),
-    "compared with": text("{compared}"),
+    "case": text_column("{case}"),
+    "precision": text_column("{precision}"),
+    "worst": lambda row: row["worst"] or NOT_MEASURED,
+    "error": number_column("error", "{:.1e}"),
+    "tolerance": number_column("tolerance", "{:.1e}"),
+    "NaN": number_column("nan", "{:,.0f}"),
+    "Inf": number_column("inf", "{:,.0f}"),
+    "compared with": text_column("{compared}"),
     "": lambda row: "green" if row["green"] else "RED",
 }
 SUMMARY: Columns = {
-    "area": text("{area}"),
-    "cases": number("cases", "{:,.0f}"),
-    "red": number("red", "{:,.0f}"),
-    "error / tolerance, at most": number("share", "{:.2g}"),
-    "NaN": number("nan", "{:,.0f}"),
-    "Inf": number("inf", "{:,.0f}"),
+    "area": text_column("{area}"),
+    "cases": number_column("cases", "{:,.0f}"),
+    "red": number_column("red", "{:,.0f}"),
+    "error / tolerance, at most": number_column("share", "{:.2g}"),
+    "NaN": number_column("nan", "{:,.0f}"),
+    "Inf": number_column("inf", "{:,.0f}"),
     "": lambda row: "RED" if row["red"] else "green",
 }
 
 
 def measure(options: DictConfig, console: Console) -> Result:
-    """Measure every case of the areas `options.stability.areas`, on the CPU.
+    """Measure every case of the areas in `options.stability.areas` on the CPU.
 
     Returns:
-        "rows": see `comparison.make_row`, and "area", "case" and "precision".
+        "rows": one for each case, with "area", "case", "precision" and the values of
+        `comparison.make_row`.
 
     Raises:
-        InputError: an unknown area or model, a number below 1.
+        InputError: an area or model is unknown, or a number is below 1.
     """
     options = options.stability
     check_names("stability.areas", options.areas, AREAS)
@@ -77,7 +83,7 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 
 def verdict(results: Result) -> str | None:
-    """Return a sentence if any case is red, else None."""
+    """Return a message that names the red cases; None if there are none."""
     rows = results["rows"]
     red = [f"{r['area']}: {r['case']} ({r['precision']})" for r in rows if not r["green"]]
     if not red:
@@ -86,12 +92,12 @@ def verdict(results: Result) -> str | None:
     return f"red: {len(red)} of {len(rows)} cases are not stable: {named}"
 
 
-def summary(rows: Sequence[Result]) -> list[Result]:
-    """Sum up each area.
+def summarize_areas(rows: Sequence[Result]) -> list[Result]:
+    """Summarize each area.
 
     Returns:
-        "area", "cases", "red", "nan", "inf" and "share": the largest error over its tolerance, None
-        without errors.
+        Rows with "area"; "cases" and "red", numbers of cases; "nan" and "inf", counts in all
+        results; "share", the largest ratio of error to tolerance, None without errors.
     """
     areas = []
     for area in dict.fromkeys(row["area"] for row in rows):
@@ -107,11 +113,10 @@ def summary(rows: Sequence[Result]) -> list[Result]:
 
 def tables(results: Result) -> list[Table]:
     """Make a table of the areas, and a table of all cases of each area."""
-    rows, areas = results["rows"], summary(results["rows"])
+    rows, areas = results["rows"], summarize_areas(results["rows"])
     red, count = sum(area["red"] for area in areas), len(rows)
     state = f"{red} of {count} cases are RED" if red else f"all {count} cases are green"
-    machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
-    notes = f"{state}\nrevision {results.get('revision')}; {machine}\n{RULE}"
+    notes = f"{state}\nrevision {results.get('revision')}; {machine_text(results)}\n{RULE}"
     shown = [make_table("Stability", SUMMARY, areas, notes)]
     for area in [row["area"] for row in areas]:
         cases = [row for row in rows if row["area"] == area]
@@ -121,7 +126,7 @@ def tables(results: Result) -> list[Table]:
 
 def plot(results: Result) -> Figure:
     """Plot each area's largest error over its tolerance."""
-    areas = summary(results["rows"])
+    areas = summarize_areas(results["rows"])
     names = [f"{row['area']}: {row['cases'] - row['red']} of {row['cases']} green" for row in areas]
     errors = {"largest error": [row["share"] or 0.0 for row in areas]}
     return bars(names, errors, "error / tolerance", tolerance=1.0)

@@ -32,6 +32,6 @@ def test_a_workload_that_became_slower_is_named(monkeypatch):
     assert torch.get_num_threads() == threads
     ratios = [row["ratio"]["median"] for row in old["rows"]]
     assert 1.3 < ratios[0] / ratios[1] < 3
-    assert compare(old, old, bench.WATCHED).worse == []
-    (worse,) = compare(old, measure(monkeypatch, 8, 32), bench.WATCHED).worse
+    assert compare(old, old, bench.TRACKED).worse == []
+    (worse,) = compare(old, measure(monkeypatch, 8, 32), bench.TRACKED).worse
     assert worse.startswith("slower: 1/once, ratio: ")

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from benchmarks.compare import compare
 from benchmarks.options import SUITES, find_suite
-from benchmarks.table import dumps
+from benchmarks.table import format_json
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 FILES = [path for path in sorted(FOLDER.rglob("*.json")) if path.stem in SUITES]
@@ -27,7 +27,7 @@ def test_every_suite_has_a_committed_result():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(FOLDER)))
 def test_committed_results_are_shown_and_compared(path):
     results, suite = json.loads(path.read_text()), find_suite(path.stem)
-    assert path.read_text() == dumps(results) + "\n"
+    assert path.read_text() == format_json(results) + "\n"
     console = Console(width=500, file=StringIO())
     for table in suite.tables(results):
         assert table.row_count > 0
@@ -37,15 +37,15 @@ def test_committed_results_are_shown_and_compared(path):
     if hasattr(suite, "plot"):
         assert suite.plot(results).axes
 
-    comparison = compare(results, results, suite.WATCHED)
+    comparison = compare(results, results, suite.TRACKED)
     assert comparison.compared > 2
     assert comparison.worse == comparison.better == comparison.missing == []
     key, factor = MEASURED.get(path.stem, ("forward", 10))
     slower = deepcopy(results)
-    for row in slower[suite.WATCHED.rows]:
+    for row in slower[suite.TRACKED.rows]:
         if isinstance(row[key], dict):
             row[key]["median"] *= factor
         elif row[key]:
             row[key] *= factor
-    worse = compare(results, slower, suite.WATCHED).worse
+    worse = compare(results, slower, suite.TRACKED).worse
     assert worse and all(sentence.startswith(("slower: ", "less exact: ")) for sentence in worse)

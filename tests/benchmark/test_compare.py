@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from asysplat.errors import InputError
 from benchmarks import compare as kinds
 from benchmarks import options
-from benchmarks.compare import Watched, compare, read_old
-from benchmarks.table import make_table, median_iqr_column, text
+from benchmarks.compare import TrackedMetrics, compare, read_old
+from benchmarks.table import make_table, median_iqr_column, text_column
 
 KINDS = {"seconds": kinds.TIME, "rate": kinds.RATE, "ratio": kinds.RATIO}
 KINDS |= dict.fromkeys(("wrong", "none"), kinds.ERROR) | {"psnr": kinds.DECIBELS}
-WATCHED = Watched(("scene", "part"), ("size",), KINDS)
+TRACKED = TrackedMetrics(("scene", "part"), ("size",), KINDS)
 MACHINE = {"cpu": "one", "cores": 2, "threads": 2, "torch": "2.11"}
 
 
@@ -50,7 +50,7 @@ CHANGES = {  # of a row: the sentence on what is worse, and on what is better
 def test_changes_beyond_noise_are_named(case):
     numbers, worse, better = CHANGES[case]
     before = row(rate=summary(8.0), none=0.0)
-    comparison = compare(results(before), results(before | numbers), WATCHED)
+    comparison = compare(results(before), results(before | numbers), TRACKED)
     assert comparison.worse == list(filter(None, [worse]))
     assert comparison.better == list(filter(None, [better]))
 
@@ -58,7 +58,7 @@ def test_changes_beyond_noise_are_named(case):
 def test_missing_numbers_are_named_and_are_no_change():
     old = results(row(), row("b", seconds=None))
     new = results(row(psnr=None), row("c", seconds=summary(90.0)))
-    comparison = compare(old, new, WATCHED)
+    comparison = compare(old, new, TRACKED)
     assert comparison.worse == comparison.better == []
     missing = ["a, psnr: was 30 dB", "b, wrong: was 1e-06", "b, psnr: was 30 dB"]
     assert comparison.missing == missing and comparison.compared == 2
@@ -68,13 +68,13 @@ def test_missing_numbers_are_named_and_are_no_change():
 
 def test_other_sizes_are_other_rows():
     with pytest.raises(InputError, match=r"^compare= has none of the rows"):
-        compare(results(row()), results(row(size=[3, 5])), WATCHED)
+        compare(results(row()), results(row(size=[3, 5])), TRACKED)
 
 
 def test_seconds_of_another_machine_are_not_compared():
     old = results(row(ratio=summary(1.0)), cpu="other", torch="2.10")
     new = results(row(seconds=summary(9.0), ratio=summary(2.0), psnr=20.0))
-    comparison = compare(old, new, WATCHED)
+    comparison = compare(old, new, TRACKED)
     note = "another machine: cpu other then and one now; seconds are not compared."
     assert comparison.notes == [note]
     assert [sentence.partition(":")[0] for sentence in comparison.worse] == ["slower", "less exact"]
@@ -102,12 +102,12 @@ def run(monkeypatch, run_script, tmp_path):
     """benchmark.py with a suite that measures these rows."""
 
     def script(*rows, **words):
-        columns = {"scene": text("{scene}"), "ms": median_iqr_column("seconds")}
+        columns = {"scene": text_column("{scene}"), "ms": median_iqr_column("seconds")}
         suite = SimpleNamespace(
             measure=lambda *_: {"rows": list(rows)},
             tables=lambda found: [make_table("Rows", columns, found["rows"])],
             plot=lambda _: Figure(),
-            WATCHED=WATCHED,
+            TRACKED=TRACKED,
         )
         monkeypatch.setattr(options, "find_suite", lambda _: suite)
         overrides = {"suite": "made", "output": tmp_path} | words

@@ -16,11 +16,11 @@ from benchmarks.data import write_photographs
 from benchmarks.pareto import (
     BASE,
     FAMILIES,
+    average_scenes,
     find_families,
     find_scenes,
     plot,
     select_inputs,
-    summarize,
     tables,
 )
 
@@ -173,7 +173,7 @@ MADE_ROWS = [
 
 
 def test_means_are_over_scenes():
-    means = {(row["family"], row["setting"]): row for row in summarize(MADE_ROWS)}
+    means = {(row["family"], row["setting"]): row for row in average_scenes(MADE_ROWS)}
     quick = means["refined", "quick"]
     assert (quick["scenes"], quick["seconds"], quick["psnr"]) == (2, 2.5, 24.25)
     assert quick["over_base"] == pytest.approx(0.5)

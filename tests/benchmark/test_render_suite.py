@@ -11,13 +11,13 @@ from benchmarks.options import find_suite
 from benchmarks.render import (
     CULLING,
     FIELDS,
-    errors,
     find_backends,
-    flips,
+    find_flips,
     measure,
-    prepare,
-    run,
+    measure_errors,
+    prepare_inputs,
     run_exact,
+    run_passes,
 )
 from benchmarks.scenes import SCENES, SMALLER, pixel_aligned_scene, random_scene
 
@@ -54,9 +54,9 @@ def test_rows_are_complete_and_culling_leaves_the_error_unchanged(results):
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
     exact = run_exact(scene)
-    outputs = run(find_backends()[0], prepare(scene))
-    none = flips(exact, exact)
-    close = errors(outputs, exact, none)
+    outputs = run_passes(find_backends()[0], prepare_inputs(scene))
+    none = find_flips(exact, exact)
+    close = measure_errors(outputs, exact, none)
     assert not none.any() and 0 < close["image_max"] < 1e-3
     assert max(close["gradients"].values()) < 1e-2
 
@@ -64,12 +64,12 @@ def test_errors_are_those_of_image_and_gradients():
     image[0, 0, 0, 0] += 1
     gradients = (exact.gradients[0] * 1.5, *exact.gradients[1:])
     other = exact._replace(image=image, gradients=gradients)
-    wrong = errors(other, exact, none)
+    wrong = measure_errors(other, exact, none)
     assert wrong["image_max"] == pytest.approx(1) and wrong["image_p99"] == 0
     assert wrong["gradients"] == pytest.approx({name: 0.5 * (name == "means") for name in FIELDS})
-    flipped = flips(other, exact)
+    flipped = find_flips(other, exact)
     assert flipped.sum() == 1 and flipped[0, 0, 0]
-    assert errors(other, exact, flipped)["image_max"] == 0
+    assert measure_errors(other, exact, flipped)["image_max"] == 0
 
 
 def test_mistakes_are_named(run_script, tmp_path):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from benchmarks.scenes import ARC, DISTANCE, on_an_arc, pixel_aligned_scene, random_scene
+from benchmarks.scenes import ARC, DISTANCE, pixel_aligned_scene, place_on_arc, random_scene
 
 
 @pytest.mark.parametrize("make, count, num", [(random_scene, 9, 9), (pixel_aligned_scene, 20, 800)])
@@ -21,7 +21,7 @@ def test_scenes_are_valid_and_visible(make, count, num):
 
 def test_cameras_on_an_arc_look_at_its_middle():
     _, camera = pixel_aligned_scene(2, 54, 96)
-    cameras = on_an_arc(camera, 5)
+    cameras = place_on_arc(camera, 5)
     cameras.validate()
     assert cameras.num_views == 5
     middle = torch.tensor([0, 0, DISTANCE, 1])

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from asysplat.errors import InputError
 from asysplat.models import head
-from benchmarks.stability.comparison import StabilityCase, compare_to_reference, unit
+from benchmarks.stability.comparison import StabilityCase, compare_to_reference, unit_roundoff
 from benchmarks.stability.hostile import HOSTILE_GAUSSIANS, hostile_views
 from benchmarks.stability.report import AREAS, measure, plot, tables, verdict
 
@@ -61,10 +61,10 @@ def compare(fast, **inputs):
 
 def test_rounding_is_green_and_more_is_red():
     assert compare(cubed)["green"]
-    for factor in (1 + 100 * unit(torch.float32), 1 - 1e-3):
+    for factor in (1 + 100 * unit_roundoff(torch.float32), 1 - 1e-3):
         assert not compare(lambda t: {"y": factor * cubed(t)["y"]})["green"]  # noqa: B023
-    nearly = compare(lambda t: {"y": (1 + 4 * unit(torch.float32)) * cubed(t)["y"]})
-    assert nearly["green"] and nearly["error"] > unit(torch.float32)
+    nearly = compare(lambda t: {"y": (1 + 4 * unit_roundoff(torch.float32)) * cubed(t)["y"]})
+    assert nearly["green"] and nearly["error"] > unit_roundoff(torch.float32)
 
 
 def test_tolerances_grow_with_the_condition_number():
