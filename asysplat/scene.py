@@ -19,6 +19,7 @@ from asysplat.errors import InputError
 ORTHONORMAL_TOLERANCE = 1e-3
 TINY = 1e-6  # depths and inverse depths above which nothing underflows
 MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
+MAPS = ("depths", "masks", "point_depths", "disparities")  # optional fields of `Views`
 
 Record = TypeVar("Record", bound="TensorRecord")
 
@@ -254,7 +255,7 @@ class Views(TensorRecord):
         size = (self.cameras.height, self.cameras.width)
         _check_float("Views.images (RGB in [0, 1])", self.images)
         _check_exact("Views.images", self.images, (*batch, 3, *size))
-        for name in ("depths", "masks", "point_depths", "disparities"):
+        for name in MAPS:
             if getattr(self, name) is not None:
                 _check_exact(f"Views.{name}", getattr(self, name), (*batch, *size))
 
@@ -265,19 +266,10 @@ class Views(TensorRecord):
     def select(self, views: Sequence[int] | Tensor) -> "Views":
         """Return the views with these indices, in the given order."""
         index = torch.as_tensor(views, device=self.images.device)
-
-        def pick(tensor: Tensor | None, dim: int) -> Tensor | None:
-            return None if tensor is None else tensor.index_select(dim, index)
-
-        return replace(
-            self,
-            cameras=self.cameras.select(index),
-            images=pick(self.images, -4),
-            depths=pick(self.depths, -3),
-            masks=pick(self.masks, -3),
-            point_depths=pick(self.point_depths, -3),
-            disparities=pick(self.disparities, -3),
-        )
+        maps = {name: getattr(self, name) for name in MAPS}
+        selected = {n: m.index_select(-3, index) for n, m in maps.items() if m is not None}
+        images = self.images.index_select(-4, index)
+        return replace(self, cameras=self.cameras.select(index), images=images, **selected)
 
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.
@@ -354,6 +346,11 @@ class Views(TensorRecord):
 def whole_pixels(masks: Bool[Tensor, "B V H W"], size: tuple[int, int]) -> Bool[Tensor, "B V h w"]:
     """Return masks of another size: True where all pixels that a pixel covers are."""
     return F.interpolate(masks.float(), size, mode="area") == 1
+
+
+def inverse_depths(depths: Float[Tensor, "*views H W"]) -> Float[Tensor, "*views H W"]:
+    """Compute 1 / depth; 0, as at infinity, for an unknown depth."""
+    return torch.where(depths > 0, 1 / depths.where(depths > 0, 1), 0)
 
 
 @dataclass(frozen=True)

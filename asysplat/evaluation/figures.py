@@ -3,14 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from asysplat.evaluation.baselines import BASELINES, nearest_view_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.rendering import Rendering
-from asysplat.scene import Views
+from asysplat.scene import Views, inverse_depths
 
 MAX_ERROR = 0.5  # at the bright end of the color map
 
@@ -29,10 +27,10 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     }
     maps = {
         "error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1),
-        "inverse depth": disparity(rendering.depth),
+        "inverse depth": inverse_depths(rendering.depth),
     }
     if targets.depths is not None:
-        maps["true inverse depth"] = disparity(targets.depths)
+        maps["true inverse depth"] = inverse_depths(targets.depths)
     if targets.masks is not None:
         maps = {name: values.where(targets.masks, torch.nan) for name, values in maps.items()}
     titles = (*images, *maps)
@@ -53,14 +51,8 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
         for axis, values in zip(row[4:], disparities, strict=True):
             axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
         for axis in row:
-            axis.set_xticks([])
-            axis.set_yticks([])
+            axis.set(xticks=[], yticks=[])
     return figure
-
-
-def disparity(depth: Float[Tensor, "*views H W"]) -> Float[Tensor, "*views H W"]:
-    """Compute 1 / depth; 0, as at infinity, for an unknown depth."""
-    return torch.where(depth > 0, 1 / depth.where(depth > 0, 1), 0)
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:

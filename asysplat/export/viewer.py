@@ -33,13 +33,12 @@ from torch import Tensor
 from asysplat.data.normalize import normalize
 from asysplat.data.photographs import open_photographs
 from asysplat.errors import InputError
-from asysplat.evaluation.figures import disparity
 from asysplat.export import viewer_cameras
 from asysplat.export.gaussians import read_gaussians, read_notes
 from asysplat.export.scene_cameras import camera_before, cameras_beside
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Cameras, Gaussians, Views, inverse_depths
 
 if TYPE_CHECKING:
     import viser  # an optional dependency
@@ -313,7 +312,7 @@ def draw_layer(
         gaussians, camera.to(gaussians.means.device), depth=layer == "depth", **options
     )
     if layer == "depth":
-        values = disparity(rendering.depth[0])
+        values = inverse_depths(rendering.depth[0])
         sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]
         values = values / sample.quantile(0.99).clamp_min(1e-12)
         colors = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]

@@ -5,8 +5,9 @@ from dataclasses import replace
 import torch
 
 from asysplat import Cameras, Views
-from asysplat.evaluation.figures import comparison_figure, disparity, learning_curve
+from asysplat.evaluation.figures import comparison_figure, learning_curve
 from asysplat.rendering import Rendering
+from asysplat.scene import inverse_depths
 
 
 def scene(depths=True):
@@ -17,8 +18,8 @@ def scene(depths=True):
     return views, Rendering(images, torch.ones(2, 16, 16), torch.full((2, 16, 16), 2.0), {})
 
 
-def test_disparity_of_an_unknown_depth_is_0():
-    found = disparity(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
+def test_the_inverse_of_an_unknown_depth_is_0():
+    found = inverse_depths(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
     torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
 
 

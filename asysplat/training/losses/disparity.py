@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Gaussians, Views, inverse_depths
 from asysplat.training.prediction import Prediction
 
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
@@ -72,8 +72,7 @@ def reference_disparities(views: Views) -> Float[Tensor, "*batch V H W"] | None:
     """Return the views' disparities, or the inverse of their depths; 0 if unknown."""
     if views.disparities is not None or views.depths is None:
         return views.disparities
-    valid = views.depths > 0
-    return torch.where(valid, 1 / torch.where(valid, views.depths, 1), 0)
+    return inverse_depths(views.depths)
 
 
 def pixels_apart(gaussians: Gaussians, inputs: Views) -> int:
