@@ -18,7 +18,6 @@ from torch import Tensor
 from asysplat.data.photographs import Photographs
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS
@@ -30,9 +29,9 @@ from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement.refine import RefinementProgress
-from asysplat.rendering import Rendering, render
+from asysplat.rendering import render
 from asysplat.runs.runs import SCENE
-from asysplat.runs.summary import metric_cells, write_json
+from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
 from asysplat.scene import Gaussians, Views
 from asysplat.terminal import print_table
 
@@ -196,10 +195,8 @@ class Results:
         views = inputs if held_out is None else held_out
         rows = min(SHEET_ROWS, views.num_views)
         views = views.select(torch.linspace(0, views.num_views - 1, rows).round().long())
-        outs = [render(gaussians, views.cameras.select([v]), self._background) for v in range(rows)]
-        parts = ("image", "alpha", "depth")
-        tensors = {part: torch.cat([getattr(out, part) for out in outs]) for part in parts}
-        figure = comparison_figure(inputs, views, Rendering(**tensors, stats={}))
+        rendering = render(gaussians, views.cameras, self._background, views_at_once=1)
+        figure = comparison_figure(inputs, views, rendering)
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)
 
@@ -243,8 +240,7 @@ def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _print_table(results: dict[str, float | int | str]) -> None:
-    rows = {"held out": "held_out", "inputs": "inputs"}
-    rows |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
+    rows = RECONSTRUCTION_ROWS
     metrics = [m for m in METRICS if any(f"{row}/{m}" in results for row in rows.values())]
     cells = [
         [title, *metric_cells(results, row, metrics)]

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.runs.run_config import flat_options, read_config
 from asysplat.runs.runs import RESULTS
+from asysplat.runs.summary import RECONSTRUCTION_ROWS
 
 CONFIG = "config.yaml"
 PICTURE = "contact.png"
@@ -20,8 +20,6 @@ MAX_NUMBER = 1e12  # in metrics.json
 MAX_TEXT = 60  # characters of a value
 COUNTS = ("gaussians", "steps", "seconds")
 SHOWN = ("psnr", "ssim", "lpips")
-ROWS = {"held out": "held_out", "inputs": "inputs"}  # title: prefix of the keys in metrics.json
-ROWS |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
 
 
 class Reconstruction(NamedTuple):
@@ -90,7 +88,7 @@ def _read_results(path: Path) -> dict[str, int | float | None]:
         raise InputError(f"{path} cannot be read ({error}): copy the run again.") from error
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")
-    measured = {f"{row}/{metric}": None for row in ROWS.values() for metric in SHOWN}
+    measured = {f"{row}/{metric}": None for row in RECONSTRUCTION_ROWS.values() for metric in SHOWN}
     results = {key: results.get(key) for key in (*COUNTS, *measured)}
     for key, value in results.items():
         absent = value is None and key in measured  # not measured, or not finite

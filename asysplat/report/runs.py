@@ -21,7 +21,6 @@ from asysplat.report.html import TEMPLATES
 from asysplat.report.reconstructions import (
     COUNTS,
     PICTURE,
-    ROWS,
     SHOWN,
     Reconstruction,
     cut,
@@ -31,7 +30,7 @@ from asysplat.report.reconstructions import (
 from asysplat.report.table import Cell, Grid, Heading
 from asysplat.report.terminal import print_grid
 from asysplat.root import typed
-from asysplat.runs.summary import metric_cells
+from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells
 
 PNG = b"\x89PNG\r\n\x1a\n"
 GENERATOR = b'<meta name="generator" content="asysplat report">'  # as in base.html.jinja
@@ -167,7 +166,10 @@ def render_runs(
 
 def _figures(run: Reconstruction) -> Grid:
     """Build a line for each set of images of a reconstruction, and for each baseline."""
-    rows = {title: metric_cells(run.results, prefix, SHOWN) for title, prefix in ROWS.items()}
+    rows = {
+        title: metric_cells(run.results, prefix, SHOWN)
+        for title, prefix in RECONSTRUCTION_ROWS.items()
+    }
     lines = [[Cell(title), *map(_cell, cells)] for title, cells in rows.items() if any(cells)]
     return Grid(FIGURES, [Heading("Images"), *(Heading(METRICS[m]) for m in SHOWN)], lines)
 

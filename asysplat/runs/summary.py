@@ -19,6 +19,9 @@ Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 # Title of a row: prefix of its keys, with a place for the test set.
 BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, (title, _) in BASELINES.items()}
 ROWS = {"trained": "test/{}"} | BASELINE_ROWS
+# The same of a reconstruction, which has one set of photographs
+RECONSTRUCTION_ROWS = {"held out": "held_out", "inputs": "inputs"}
+RECONSTRUCTION_ROWS |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
 
 
 def write_json(path: Path, results: Results) -> None:

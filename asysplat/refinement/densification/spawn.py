@@ -59,13 +59,10 @@ class ErrorDensifier(Densifier):
         if count > 0:
             order = random_permutation(views.num_views, self.generator)
             views, gaussians = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
-            cameras = (views.cameras.select([view]) for view in range(views.num_views))
-            outs = [
-                render(gaussians, camera, self.background, depth="median") for camera in cameras
-            ]
-            images = torch.cat([out.image for out in outs])
-            depths = torch.cat([out.depth for out in outs if out.depth is not None])
-            new = spawn_at_errors(views, images, depths, count, self.generator)
+            background, cameras = self.background, views.cameras
+            out = render(gaussians, cameras, background, depth="median", views_at_once=1)
+            assert out.depth is not None
+            new = spawn_at_errors(views, out.image, out.depth, count, self.generator)
             self.fields.append(new, self.units(new.means))
             visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
             self._last_visible = torch.cat((self._last_visible, visible))
