@@ -168,10 +168,8 @@ class SceneDataModule(lightning.LightningDataModule):
         """
         check(self.inputs)
         for name, tasks in self.tests.items():
-            try:
+            with self._naming(name):
                 check(tasks[0]["inputs"].num_views)
-            except InputError as error:
-                raise InputError(f"data.test_sets.{name}: {error}") from error
 
     def split(self, processes: int) -> BatchSplit:
         """Divide the scenes of an optimizer step among processes."""

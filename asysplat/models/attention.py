@@ -75,15 +75,12 @@ class SparseAttention(nn.Module):
     Args:
         grid: p_g.
         conv_blocks: whether to add the two conv blocks, which connect the grid places of a view.
-        group_width: channels of a convolution group at the paper's head_dim of 64; proportional
-            to the head_dim.
     """
 
-    def __init__(
-        self, shape: StageShape, grid: int = 2, conv_blocks: bool = True, group_width: int = 32
-    ):
+    def __init__(self, shape: StageShape, grid: int = 2, conv_blocks: bool = True):
         super().__init__()
-        group_width = max(1, group_width * shape.head_dim // 64)
+        # 32 channels of a convolution group at the paper's head_dim of 64
+        group_width = max(1, shape.head_dim // 2)
         self.convs = ConvBlocks(shape.width, group_width) if conv_blocks else nn.Identity()
         self.attention = SelfAttention(shape, grid)
 

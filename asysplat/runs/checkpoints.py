@@ -120,14 +120,12 @@ def config_diff(metadata: Mapping[str, Any], config: Mapping[str, Any], revision
     return differences
 
 
-def check_checkpoint(path: Path | None, module: nn.Module) -> None:
+def check_checkpoint(path: Path, module: nn.Module) -> None:
     """Check the names and shapes of the weights before training.
 
     Raises:
         InputError: the file cannot be read, or holds the weights of another model.
     """
-    if path is None:
-        return
     try:
         if path.suffix == ".safetensors":
             with safe_open(path, "pt") as file:

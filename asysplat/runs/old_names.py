@@ -85,11 +85,6 @@ def upgrade_config(config: Mapping[Any, Any], prefix: str = "") -> dict[Any, Any
     return upgraded
 
 
-def upgrade_results(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what metrics.json or evaluation.json holds, under today's names."""
-    return _upgrade(results)
-
-
 def upgrade_checkpoint(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a checkpoint under today's names; its weights are as they were."""
     upgraded = dict(checkpoint)
@@ -97,19 +92,24 @@ def upgrade_checkpoint(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
         upgraded["hyper_parameters"] = upgrade_config(upgraded["hyper_parameters"])
     if "callbacks" in upgraded:
         states = upgraded["callbacks"].items()
-        upgraded["callbacks"] = {CALLBACKS.get(key, key): _upgrade(state) for key, state in states}
+        upgraded["callbacks"] = {
+            CALLBACKS.get(key, key): upgrade_results(state) for key, state in states
+        }
     return upgraded
 
 
-def _upgrade(state: Any) -> Any:
-    """Rename the keys of results in nested values."""
-    if isinstance(state, list):
-        return [_upgrade(each) for each in state]
-    if not isinstance(state, Mapping):
-        return state
+def upgrade_results(results: Any) -> Any:
+    """Return the content of metrics.json or evaluation.json, or a part of it, under today's names.
+
+    So are the states of callbacks, which have some of the keys.
+    """
+    if isinstance(results, list):
+        return [upgrade_results(value) for value in results]
+    if not isinstance(results, Mapping):
+        return results
     upgraded = {}
-    for key, value in state.items():
+    for key, value in results.items():
         for old, new in RESULTS.items() if isinstance(key, str) else ():
             key = re.sub(old, new, key)
-        upgraded[key] = _upgrade(value)
+        upgraded[key] = upgrade_results(value)
     return upgraded

@@ -169,7 +169,7 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 
 def find_runs(logs: Path) -> Iterator[Run]:
     """Yield every finished run below `logs`, oldest first; warn of results that are damaged."""
-    for path in _results_below(logs):
+    for path in files_below(logs, RESULTS):
         if _is_reconstruction(path.parent):
             continue
         try:
@@ -189,12 +189,13 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 def find_reconstructions(logs: Path) -> list[Path]:
     """Return the folders of the finished reconstructions below `logs`, oldest first."""
-    folders = (path.parent for path in _results_below(logs))
+    folders = (path.parent for path in files_below(logs, RESULTS))
     return [folder for folder in folders if _is_reconstruction(folder)]
 
 
-def _results_below(logs: Path) -> list[Path]:
-    return sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
+def files_below(folder: Path, name: str) -> list[Path]:
+    """Return the files of a name below a folder, oldest first."""
+    return sorted(folder.rglob(name), key=lambda path: (path.stat().st_mtime, path))
 
 
 def _is_reconstruction(folder: Path) -> bool:

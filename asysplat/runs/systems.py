@@ -12,7 +12,7 @@ from omegaconf import MISSING, DictConfig
 
 from asysplat.runs.old_names import upgrade_results
 from asysplat.runs.run_config import plain_options
-from asysplat.runs.runs import EVALUATION, Run, content_of, hash_of, name_of
+from asysplat.runs.runs import EVALUATION, Run, content_of, files_below, hash_of, name_of
 
 SYSTEM = "evaluation/system"
 TESTED = "tested/"
@@ -66,8 +66,7 @@ def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
 
 def find_systems(logs: Path) -> Iterator[Run]:
     """Yield every finished evaluation of another system below `logs`, oldest first."""
-    paths = sorted(logs.rglob(EVALUATION), key=lambda path: (path.stat().st_mtime, path))
-    for path in paths:
+    for path in files_below(logs, EVALUATION):
         try:
             results: Mapping[str, Any] = json.loads(path.read_text())
             if SYSTEM not in results:

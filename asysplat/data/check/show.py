@@ -105,8 +105,7 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
                 foot = (x - distance * a, y - distance * b)
                 plot.axline(foot, (foot[0] - b, foot[1] + a), color=color, lw=0.8)
             plot.plot(x, y, "o", color=color, ms=5, mec="white", mew=0.7)
-        plot.set_xlim(0, width)
-        plot.set_ylim(height, 0)
+        plot.set(xlim=(0, width), ylim=(height, 0))
 
 
 def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
