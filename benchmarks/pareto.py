@@ -121,7 +121,7 @@ class FeedForward:
     max_gaussians: int | None = None  # cells grow until at most this many are left; None: no limit
     sh_degree: int | None = None  # highest SH degree rendered; None: all
     views_at_once: int | None = None  # number of views rendered together; None: all
-    limits: Mapping[str, float] = field(default_factory=dict)  # fields of `BlendingLimits`
+    limits: Mapping[str, float] = field(default_factory=dict)  # cut-offs of the renderer
 
     def __post_init__(self):
         check_names("precision", [self.precision], [*PRECISIONS, EXACT])
@@ -279,9 +279,9 @@ def find_scenes(
     scenes, absent = {}, {}
     for name in names:
         if name in PROCEDURAL:
-            scenes[name] = partial(_procedural_scene, name)
+            scenes[name] = partial(_open_procedural_scene, name)
         elif name in present:
-            scenes[name] = partial(_real_scene, folder / name)
+            scenes[name] = partial(_open_real_scene, folder / name)
         else:
             absent[name] = f"{folder / name} is no folder"
     if not scenes:
@@ -292,15 +292,15 @@ def find_scenes(
     return scenes, absent
 
 
-def _procedural_scene(name: str, side: int, inputs: int, targets: int) -> Photographs:
+def _open_procedural_scene(name: str, side: int, inputs: int, targets: int) -> Photographs:
     scene = ProceduralScene(split_seed("test", 0), side, side, FRAMES, places=PROCEDURAL[name])
     frames = uniform_selection(FRAMES, inputs, targets)
     views = [_without_depths(scene.views(chosen)) for chosen in (frames.inputs, frames.targets)]
-    frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
-    return Photographs(name, *views, [], [], frame, None)
+    normalization = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
+    return Photographs(name, *views, [], [], normalization, None)
 
 
-def _real_scene(path: Path, side: int, inputs: int, targets: int) -> Photographs:
+def _open_real_scene(path: Path, side: int, inputs: int, targets: int) -> Photographs:
     # The photographs are too small for the check of the cameras: its warning is dropped.
     limits = {"views": inputs, "held_out_every": HELD_OUT_EVERY, "max_held_out": targets}
     return open_photographs(path, side, side, **limits, say=lambda _: None)
@@ -457,13 +457,13 @@ def measure(options: DictConfig, console: Console) -> Result:
     if not torch.cuda.is_available():
         absent["a GPU"] = "there is none"
     rows: list[Result] = []
-    parts = [
+    pairs = [
         (name, f) for name in scenes for f in families if name in (config[f]["scenes"] or scenes)
     ]
-    total = sum(count_runs(families[family], options.repeats) for _, family in parts)
+    total = sum(count_runs(families[family], options.repeats) for _, family in pairs)
     with Progress(console=console, transient=True) as bars:
         advance = partial(bars.advance, bars.add_task("measuring", total=total))
-        for name, family in parts:
+        for name, family in pairs:
             sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
             scene, settings = scenes[name](**sizes), families[family]
             scene_rows = _measure_scene(
@@ -487,7 +487,7 @@ def average_scenes(rows: Sequence[Result]) -> list[Result]:
     """
     bases = {(row["family"], row["scene"]): row for row in rows if row["setting"] == BASE}
     means = []
-    for (family, name), group in _grouped(rows, "family", "setting").items():
+    for (family, name), group in _group_rows(rows, "family", "setting").items():
         timed = [row for row in group if row["seconds"]]
         values = {
             "seconds": [row["seconds"]["median"] for row in timed],
@@ -507,7 +507,7 @@ def average_scenes(rows: Sequence[Result]) -> list[Result]:
     return means
 
 
-def _grouped(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[Result]]:
+def _group_rows(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[Result]]:
     groups: dict[tuple[str, ...], list[Result]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names), []).append(row)
@@ -518,16 +518,16 @@ def tables(results: Result) -> list[Table]:
     """Show the settings of each family on each scene, then their means over the scenes."""
     absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
     notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
-    scenes = _grouped(results["rows"], "family", "scene").items()
+    scenes = _group_rows(results["rows"], "family", "scene").items()
     shown = [make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes]
-    for (name,), rows in _grouped(average_scenes(results["rows"]), "family").items():
+    for (name,), rows in _group_rows(average_scenes(results["rows"]), "family").items():
         shown.append(make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes))
     return shown
 
 
 def plot(results: Result) -> Figure:
     """Plot the mean PSNR of each family, or its error if untrained, against mean seconds."""
-    families = _grouped(average_scenes(results["rows"]), "family")
+    families = _group_rows(average_scenes(results["rows"]), "family")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(1.0 + 5.2 * len(families), 5.0), layout="constrained")
         grid = figure.subplots(1, len(families), squeeze=False)[0]

@@ -52,7 +52,7 @@ class BadImages:
         """Report the collected errors, after all images of a scene were read.
 
         Args:
-            scene: its name, for the message.
+            scene: name of the scene, for the message.
             usable: number of its images that can be used.
 
         Raises:

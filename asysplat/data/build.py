@@ -22,11 +22,11 @@ def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> Sc
     Args:
         test_sets: name -> the options in which a further test set differs: inputs, targets, height,
             width, num_images, test_scenes or places; and prune (see Task).
-        options: those of ProceduralSource and SceneDataModule; and test_size, the height and width
-            of all tests but of sets with their own, None for the size of training.
+        options: options of ProceduralSource and SceneDataModule; and test_size, the height and
+            width of every test set that does not set its own, None for the size of training.
 
     Raises:
-        InputError: a test set with the name of the data set, or with an unknown option.
+        InputError: a test set has the name of the data set, or an unknown option.
     """
     sets = tested_sets(test_sets, options["name"], on_disk=False)
     changeable = ("num_images", "test_scenes", "places")
@@ -40,7 +40,7 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
         test_sets: as for `procedural_data`; the options are inputs, targets, height, width, prune,
             layout, scenes, selection, index and root. A set whose root is null is left out, with a
             warning.
-        options: those of FilesSource, SceneOptions and SceneDataModule; and test_size.
+        options: options of FilesSource, SceneOptions and SceneDataModule; and test_size.
 
     Raises:
         InputError: as `procedural_data` and FilesSource.
@@ -112,7 +112,7 @@ def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -
 
     Args:
         test_sets: name -> the options in which it differs from the data set.
-        name: the data set's.
+        name: name of the data set.
         on_disk: whether the data set is read from disk.
     """
     return {

@@ -59,7 +59,7 @@ class ProceduralSource:
         num_images: length of each camera path.
         window: least and greatest number of consecutive images that a training task is drawn from;
             None: all images.
-        first_window: those of the first task; None: `window`.
+        first_window: window of the first task; None: `window`.
         val_scenes, test_scenes: number of scenes of each split.
         places: content of the scenes: both, rooms or outdoors.
         varied: whether training scenes are varied; see ProceduralScene.
@@ -139,7 +139,7 @@ class FilesSource:
         root, test_root: one scene, or a folder of scenes.
         window: least and greatest number of consecutive images that a training task is drawn from;
             None: all images.
-        first_window: those of the first task; None: `window`.
+        first_window: window of the first task; None: `window`.
         scenes: names of the folders that test; None: all.
         selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.

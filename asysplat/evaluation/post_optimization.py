@@ -89,7 +89,7 @@ class PostOptimization:
         """Measure one scene; the costs do not include the metrics.
 
         Args:
-            scene: its name.
+            scene: name of the scene.
             predict: the input views -> [N] Gaussians in their frame.
             inputs, targets: the scene's views, without a batch dimension.
             watch: called after each step with the number of steps and, at the steps to measure, the

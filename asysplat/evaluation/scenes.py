@@ -45,7 +45,7 @@ def measure_scenes(
         predictor: returns the `predict` of a scene, whose costs are measured; see
             `PostOptimization`.
         measure: measures a scene.
-        device: that computes.
+        device: device that computes.
         folder: folder for figures/evaluation-post<steps>.png, which show the first scene at the
             first and the last of the steps.
         scene_folder: folder of the results of single scenes, which are read and written there.

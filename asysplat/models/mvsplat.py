@@ -31,7 +31,7 @@ class MVSplat(Network):
         width: factor of all channels.
         geometry_ratio, parameter_budget: must be None and 1: there is one branch.
         channels: number of channels of the features.
-        refine_channels: that of the U-Net over pixels.
+        refine_channels: number of channels of the U-Net over pixels.
         planes: number of inverse depths of the volume, equally spaced.
         near, far: least and greatest depth, in units of the normalized scene.
         sh_degree: 0 to 3.

@@ -89,7 +89,7 @@ def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
 
     Args:
         mix: counts and letters.
-        letters: those that name a block.
+        letters: letters that name a block.
 
     Raises:
         InputError: anything else, or no layer at all.

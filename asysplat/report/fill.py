@@ -65,11 +65,11 @@ def fill_table(
     """Fill a table with every finished run that has the configuration of one of its rows.
 
     Args:
-        table: the paper's.
+        table: table of the paper.
         overrides: options of the command that started the sweep, without `sweeps=`. Paths may be
             left out; a given path must have the same name as the run's.
         compose: returns train.py's configuration.
-        runs: to select from.
+        runs: finished runs to select from.
         systems: evaluations of other systems, see `system_rows`.
     """
     if table.claims:

@@ -135,7 +135,7 @@ def render_runs(
     """Write the page: an overview that links to a section for each reconstruction.
 
     Args:
-        folder: that was searched.
+        folder: folder that was searched.
         runs, left_out: see `read_reconstructions`.
         page: the file that the page will be; its links are relative to it.
     """

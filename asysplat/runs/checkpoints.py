@@ -167,8 +167,8 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
 
     Args:
         path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
-        module: to load into.
-        option: that named the path, for messages.
+        module: module to load into.
+        option: option that named the path, for messages.
 
     Raises:
         InputError: there is no such file, it is damaged, or it does not fit.

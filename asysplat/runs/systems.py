@@ -27,7 +27,7 @@ def describe_system(config: DictConfig, gaussians: Path, system: str | None) -> 
     Args:
         config: configuration of train.py.
         gaussians: a folder of files of Gaussians, or one file.
-        system: its name; None: that of the folder or file.
+        system: name of the system; None: that of the folder or file.
     """
     absolute = Path(os.path.abspath(gaussians))
     name = absolute.stem if absolute.is_file() else absolute.name

@@ -26,8 +26,8 @@ MIN_INVERSE_DEPTH = 1e-30  # avoids division by 0 where the plane sweep finds no
 # Weights of the decoder are multiplied by this factor, as after a failed training
 WILD, WILD_FACTOR = "wild weights", 1e4
 # Hostile views that are measured in half precision too
-HALF = ("black photographs", "noise photographs", "poses kilometers apart")
-HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
+HALF_PRECISION_VIEWS = ("black photographs", "noise photographs", "poses kilometers apart")
+HALF_PRECISION_VIEWS += ("fisheye-like focal lengths", "telescopic focal lengths")
 # Roundings in sequence: fewer than the 3,600 operations that round in both passes of the network at
 # laptop scale. In half precision only products round, so that ROUNDINGS suffice.
 NETWORK_ROUNDINGS = 1024
@@ -91,7 +91,11 @@ def network_cases(
         views = hostile_views(counts)
         cases = [(name, views[name], "fp32") for name in views]
         cases.append((WILD, HostileViews(), "fp32"))
-        cases += [(name, views[name], precision) for precision in ("bf16", "fp16") for name in HALF]
+        cases += [
+            (name, views[name], precision)
+            for precision in ("bf16", "fp16")
+            for name in HALF_PRECISION_VIEWS
+        ]
         for name, hostile, precision in cases:
             run = partial(_measure_network, net, hostile, precision, wild=name == WILD)
             yield StabilityCase(f"{model}, {name}", precision, run)

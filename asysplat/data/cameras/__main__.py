@@ -18,8 +18,9 @@ from asysplat.interrupts import handle_signals
 def main(arguments: list[str] | None = None) -> int:
     parser = ArgumentParser(prog="asysplat cameras", description=__doc__)
     parser.add_argument("path", type=Path, help="a folder of photographs, or a video")
-    parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help="outside of it")
-    parser.add_argument("--frames", type=int, default=100, help="of a video, at most")
+    help_of_out = "folder of the cameras, outside of that of the photographs"
+    parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help=help_of_out)
+    parser.add_argument("--frames", type=int, default=100, help="greatest number, of a video")
     parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
     options = parser.parse_args(arguments)
     try:

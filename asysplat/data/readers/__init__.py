@@ -145,7 +145,7 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
     """Open one scene without reading pixels.
 
     Args:
-        scene: its folder, or a path that `find_scenes` returned.
+        scene: folder of the scene, or a path that `find_scenes` returned.
 
     Raises:
         InputError: files that cannot be used, or fewer than two images.

@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--layout", default="auto")
     parser.add_argument("--selection", choices=SELECTIONS, default="kmeans")
     parser.add_argument("--inputs", type=int, default=32)
-    parser.add_argument("--targets", type=int, default=8, help="of every_8th and uniform")
+    parser.add_argument("--targets", type=int, default=8, help="number, for every_8th and uniform")
     options = parser.parse_args(arguments)
     index: dict[str, Selection] = {}
     try:
