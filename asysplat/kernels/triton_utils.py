@@ -10,11 +10,19 @@ INTERPRETED = triton.knobs.runtime.interpret  # True in tests on a CPU, where Nu
 # Launch option: a product and a sum may become one fused multiply-add. The renderer forbids it, as
 # its two passes must round alike to take the same decisions; no operator's kernels depend on that.
 FUSED = {"enable_fp_fusion": True}
+# Sizes that change within a run, as Gaussians are added and views are selected. Triton would
+# compile a kernel again whenever one becomes 1, a multiple of 16 or neither.
+CHANGING = {"num", "num_visible", "num_splats", "views", "length", "chunks"}
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile a function as a kernel, without the wrapper that a type checker put around it."""
-    return triton.jit(inspect.unwrap(function))
+    """Compile a function as a kernel, without the wrapper that a type checker put around it.
+
+    It is compiled once for all values of CHANGING.
+    """
+    function = inspect.unwrap(function)
+    changing = [name for name in inspect.signature(function).parameters if name in CHANGING]
+    return triton.jit(function, do_not_specialize=changing)
 
 
 @kernel

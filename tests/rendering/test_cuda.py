@@ -1,6 +1,7 @@
 """The Triton renderer against the reference in float64: on a GPU, or in Triton's interpreter."""
 
 import sys
+from collections import Counter
 
 import pytest
 import torch
@@ -135,6 +136,22 @@ def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
     assert {grad.dtype for grad in grads} == {torch.float64}
     exact = run(reference.draw, *scene, RenderSettings())
     assert max(errors((images, grads), exact)[0]) <= 1e-6
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
+def test_kernels_are_compiled_once_for_all_numbers_of_gaussians_and_views(make_scene, monkeypatch):
+    import triton
+
+    compiled = []
+    hook = lambda **event: compiled.append(event["fn"].name)  # noqa: E731
+    monkeypatch.setattr(triton.knobs.runtime, "jit_post_compile_hook", hook)
+    settings = RenderSettings(depth="median", limits=GSPLAT_1_5)
+    for count, views in ((33, 3), (1, 1), (16, 2), (64, 16), (35, 1)):
+        run(
+            draw_by_cuda, *make_batch(make_scene, views=views, count=count, device=DEVICE), settings
+        )
+    assert max(Counter(compiled).values(), default=0) <= 2, compiled  # list_tiles: twice
 
 
 @pytest.mark.gpu
