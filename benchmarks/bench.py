@@ -95,7 +95,7 @@ def make_pairs() -> Iterator[Pair]:
 
     # A forward pass and its matrix products and convolutions
     net, _ = make_net(NETWORK, {"scale": "laptop"}, CPU)
-    workload = Workload(net, "fp32", make_views(VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
+    workload = Workload(net, "fp32", make_views(1, VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
     with RecordProducts() as products:
         workload.forward()
     yield Pair(NETWORK, "products", workload.forward, products.run)

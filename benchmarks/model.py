@@ -17,6 +17,7 @@ from rich.progress import track
 from rich.table import Table
 
 from asysplat import models, ops
+from asysplat.evaluation.measured_cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.static_cost import count_parameters
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
@@ -32,7 +33,7 @@ from benchmarks.timing import Measurement, Result, Run, device_time, measure_run
 
 TRACKED = TrackedMetrics(
     names=("model", "views", "precision"),
-    must_match=("parameters", "height", "width"),
+    must_match=("parameters", "scenes", "checkpointing", "height", "width"),
     kinds=dict.fromkeys(("forward", "step"), TIME),
 )
 COMPONENTS = {  # layers, none of which contains another
@@ -49,7 +50,7 @@ PARTS = (*COMPONENTS, OTHERS)
 OPERATORS = ("ssd", "selective_scan", "grid_attention")
 LAYER_CODES = {inspect.unwrap(kind.forward).__code__ for k in COMPONENTS.values() for kind in k}
 OPERATOR_CODES = {inspect.unwrap(getattr(ops, name)).__code__: name for name in OPERATORS}
-NOTES = "step: forward and backward; -: not measured"
+NOTES = "step: forward and backward; GB: its peak (on a CPU the process's); -: not measured"
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Workload:
 
     net: Network  # with random weights
     precision: str  # key of PRECISIONS; bf16 by autocast
-    views: Views  # input views of one scene
+    views: Views  # input views, [scenes, V]
 
     @property
     def device(self) -> torch.device:
@@ -77,6 +78,12 @@ class Workload:
             means = [getattr(gaussians, field.name).float().mean() for field in fields(gaussians)]
         sum(means).backward()
         self.net.zero_grad(set_to_none=True)
+
+    def measure_peak_gb(self) -> float | None:
+        """Run a training step; return its peak memory, see `peak_memory_gb`, if it is known."""
+        known = reset_peak_memory(self.device)
+        self.step()
+        return peak_memory_gb(self.device) if known else None
 
     def _autocast(self, device: str) -> torch.autocast:
         dtype = PRECISIONS[self.precision]
@@ -103,11 +110,11 @@ def make_net(
     return net, {name: config.data[name] for name in ("inputs", "height", "width")}
 
 
-def make_views(views: int, height: int, width: int, device: torch.device) -> Views:
-    """Make views of noise from cameras on an arc; the same numbers at every call."""
+def make_views(scenes: int, views: int, height: int, width: int, device: torch.device) -> Views:
+    """Make views of noise from cameras on an arc; the same numbers for every scene and call."""
     _, camera = random_scene(1, height, width)
     images = torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
-    return Views(place_on_arc(camera, views), images).to(device)
+    return Views.stack([Views(place_on_arc(camera, views), images)] * scenes).to(device)
 
 
 def time_parts(forward: Run, device: torch.device) -> dict[str, float]:
@@ -146,14 +153,18 @@ def measure(options: DictConfig, console: Console) -> Result:
     for name in track(config.names, "networks", console=console):
         net, size = make_net(name, config.overrides, device)
         net.check_size(size["height"], size["width"])
+        net.checkpoint_layers(config.checkpoint_layers)
         for num_views in config.views or [size["inputs"]]:
-            views = make_views(num_views, size["height"], size["width"], device)
+            views = make_views(config.scenes, num_views, size["height"], size["width"], device)
             row = {"model": name, "parameters": count_parameters(net), "views": num_views}
             row |= {"height": size["height"], "width": size["width"]}
+            row |= {"scenes": config.scenes, "checkpointing": config.checkpoint_layers}
             for precision in config.precisions:
                 workload = Workload(net, precision, views)
+                row = row | {"precision": precision}
+                row["step_gb"] = workload.measure_peak_gb() if config.steps else None
                 timer = partial(_time_workload, workload, config.steps)
-                measurements.append(Measurement(timer, row | {"precision": precision}))
+                measurements.append(Measurement(timer, row))
     time_in_rounds(measurements, options.repeats, console)
     rows = []
     for timed in measurements:
@@ -182,9 +193,10 @@ def tables(results: Result) -> list[Table]:
             parts.append(row | {"part": name, "seconds": seconds, "share": fraction})
     networks = {
         "model": text_column("{model}"),
-        "inputs": text_column("{views} x {height}x{width}, {precision}"),
+        "inputs": text_column("{scenes} x {views} x {height}x{width}, {precision}"),
         "forward\nms": median_iqr_column("forward"),
         "step\nms": median_iqr_column("step"),
+        "GB": number_column("step_gb", "{:.1f}"),
     }
     components = {
         "model": text_column("{model}"),

@@ -23,11 +23,12 @@ def run_model(run_suite):
 
 
 def test_rows_are_complete_and_parts_are_those_of_the_model(run_model):
-    results = run_model("1m1s1t", views=[1, 2])
+    results = run_model("1m1s1t", views=[1, 2], scenes=2, checkpoint_layers=True)
     assert [row["views"] for row in results["rows"]] == [1, 2]
     for row in results["rows"]:
         assert row["model"] == "asysplat_4m4s" and row["parameters"] > 1e5
-        assert (row["height"], row["width"]) == (64, 64)
+        assert (row["scenes"], row["height"], row["width"]) == (2, 64, 64)
+        assert row["checkpointing"] and row["step_gb"] > 0.1
         assert all(row[key]["median"] > 0 and row[key]["iqr"] >= 0 for key in ("forward", "step"))
         seconds = {name: part["seconds"]["median"] for name, part in row["components"].items()}
         assert set(seconds) == {*COMPONENTS, OTHERS} and min(seconds.values()) > 0
@@ -41,7 +42,7 @@ def test_steps_and_absent_parts_are_left_out(run_model):
     results = run_model("1m", views=[1], steps=False)
     (row,) = results["rows"]
     assert row["step"] is None
-    assert list(tables(results)[0].columns[-1].cells) == ["-"]
+    assert [list(column.cells) for column in tables(results)[0].columns[-2:]] == [["-"], ["-"]]
     assert not row["components"].keys() & {"sparse attention", "full attention"}
 
 
