@@ -71,19 +71,27 @@ class SelectiveAdam:
             InputError: a gradient or mask that is missing or has another shape.
         """
         _expect("visible", visible, (self.num_rows,))
-        tensors = []
+        row_rates = {}
         for name, rate in rates.items():
+            parameter = self.parameters[name]
+            rate = torch.as_tensor(rate, dtype=parameter.dtype)
+            numbers = rate.expand(parameter.shape[1:]).reshape(-1)
+            if numbers.any():
+                row_rates[name] = numbers
+        if not row_rates:
+            return
+        # One transfer for all, as a GPU waits for each.
+        sizes = [len(numbers) for numbers in row_rates.values()]
+        moved = torch.cat([*row_rates.values()]).to(visible.device).split(sizes)
+        tensors = []
+        for name, numbers in zip(row_rates, moved, strict=True):
             parameter, state = self.parameters[name], self._state[name]
-            rate = torch.as_tensor(rate, dtype=parameter.dtype, device=parameter.device)
-            row_rates = rate.expand(parameter.shape[1:]).reshape(-1)
-            if row_rates.any():
-                gradient = _expect(f"gradient of {name}", gradients.get(name), parameter.shape)
-                gradient = gradient.to(parameter).contiguous()
-                numbers = (parameter, gradient, state["mean"], state["square"])
-                flat = (tensor.view(self.num_rows, len(row_rates)) for tensor in numbers)
-                tensors.append(Rows(*flat, state["steps"], row_rates))
-        if tensors:
-            self.non_finite += adam_step(tensors, visible.contiguous(), self._settings)
+            gradient = _expect(f"gradient of {name}", gradients.get(name), parameter.shape)
+            gradient = gradient.to(parameter).contiguous()
+            fields = (parameter, gradient, state["mean"], state["square"])
+            flat = (tensor.view(self.num_rows, len(numbers)) for tensor in fields)
+            tensors.append(Rows(*flat, state["steps"], numbers.to(parameter.dtype)))
+        self.non_finite += adam_step(tensors, visible.contiguous(), self._settings)
 
     @torch.no_grad()
     def keep(self, index: Int[Tensor, "M"]) -> None:

@@ -6,12 +6,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from asysplat.kernels.dispatch import choose_fastest
 from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 
 
 @torch.no_grad()
 def adam_step(tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings) -> int:
-    """Update the visible rows in place, by a kernel for float32 on a CPU, else by torch.
+    """Update the visible rows in place, float32 by the kernels of its device, else by torch.
 
     A row that is not visible, or has a non-finite gradient in any of the tensors, keeps its
     parameters and averages in all of them.
@@ -23,8 +24,13 @@ def adam_step(tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: Ada
     Returns:
         The number of visible rows with a non-finite gradient.
     """
-    if all(rows.parameter.dtype == torch.float32 and rows.parameter.is_cpu for rows in tensors):
+    backends = {choose_fastest(rows.parameter, "reference") for rows in tensors}
+    if backends == {"cpu"}:
         from asysplat.ops.adam.cpu import adam_step_cpu
 
         return adam_step_cpu(tensors, visible, settings)
+    if backends == {"cuda"}:
+        from asysplat.ops.adam.cuda import adam_step_cuda
+
+        return adam_step_cuda(tensors, visible, settings)
     return adam_step_reference(tensors, visible, settings)

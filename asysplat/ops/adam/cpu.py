@@ -4,7 +4,6 @@ Rows of K < 16 numbers are updated sixteen at a time, as K vectors; longer rows 
 block's gradients are checked in all tensors before its update, which then finds them in the cache.
 """
 
-import math
 from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
@@ -28,10 +27,10 @@ from asysplat.kernels.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.adam.corrections import tabulate_corrections
 from asysplat.ops.adam.reference import AdamSettings, Rows
 
 BLOCK = 1024  # rows of a block
-ROUNDING = 2.0**-25  # number so small that 1 - ROUNDING is rounded to 1 in float32
 
 
 class FlatRows(NamedTuple):
@@ -59,7 +58,7 @@ class Constants(NamedTuple):
     Args:
         beta2, eps: see `AdamSettings`.
         new1, new2: 1 - beta1 and 1 - beta2, the weights of the new gradient and its square.
-        corrections: [steps, 2], factors of the mean and of the root after each number of steps.
+        corrections: [steps, 2], see `tabulate_corrections`.
     """
 
     beta2: np.float32
@@ -94,17 +93,12 @@ def _row_indices(numbers: int) -> np.ndarray:
 
 @cache
 def _constants(settings: AdamSettings) -> Constants:
-    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) up to the step t where both are 1."""
-    slowest = max(settings.beta1, settings.beta2, ROUNDING)
-    t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))
-    t[0] = 1  # unused: a row's first step is 1
-    first, second = 1 - settings.beta1**t, 1 - settings.beta2**t
     return Constants(
         beta2=np.float32(settings.beta2),
         new1=np.float32(1 - settings.beta1),
         new2=np.float32(1 - settings.beta2),
         eps=np.float32(settings.eps),
-        corrections=np.stack((1 / first, 1 / np.sqrt(second)), -1).astype(np.float32),
+        corrections=tabulate_corrections(settings),
     )
 
 

@@ -1,0 +1,69 @@
+"""The Triton kernels of Adam against the reference in float64: on a GPU, or interpreted."""
+
+import pytest
+import torch
+from compiler import DEVICE, INTERPRETED, collect_kernels, kernel
+
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
+
+triton = pytest.importorskip("triton")
+
+NUM = 300
+NUMBERS = (1, 3, 4, 48)  # of a row of each tensor
+
+
+def make_tensors(dtype=torch.float32, device="cpu"):
+    generator = torch.Generator().manual_seed(0)
+    rows = []
+    for numbers in NUMBERS:
+        values = torch.randn(NUM, numbers, generator=generator).to(device, dtype)
+        rates = torch.linspace(0, 0.1, numbers + 1)[1:].to(device, dtype)
+        steps = torch.zeros(NUM, dtype=torch.int32, device=device)
+        state = (torch.zeros_like(values), torch.zeros_like(values), steps)
+        rows.append(Rows(values, torch.zeros_like(values), *state, rates))
+    return rows
+
+
+@kernel
+@pytest.mark.parametrize("settings", [AdamSettings(0.9, 0.999, 1e-15), AdamSettings(0.0, 0.5, 0.1)])
+def test_visible_rows_with_finite_gradients_are_those_of_the_reference(settings):
+    from asysplat.ops.adam.cuda import adam_step_cuda
+
+    exact, ours = make_tensors(torch.float64), make_tensors(device=DEVICE)
+    begin = make_tensors()
+    for step in range(5):
+        visible = torch.rand(NUM) < 0.6
+        visible[:3] = torch.tensor([True, True, False])
+        visible[-1] = False  # in no step
+        for a, b in zip(exact, ours, strict=True):
+            gradient = torch.randn(a.gradient.shape) * 10 ** torch.linspace(-6, 4, NUM)[:, None]
+            gradient[-1] = torch.nan
+            if step == 2:
+                gradient[0, -1], gradient[2, 0] = torch.inf, torch.nan
+            if step == 3 and gradient.shape[1] == 4:
+                gradient[1, 2] = torch.nan
+            a.gradient.copy_(gradient)
+            b.gradient.copy_(gradient)
+        dropped = adam_step_reference(exact, visible, settings)
+        assert adam_step_cuda(ours, visible.to(DEVICE), settings) == dropped == (step in (2, 3))
+    for a, b, first in zip(exact, ours, begin, strict=True):
+        assert torch.equal(a.steps, b.steps.cpu()) and a.steps.max() == 5
+        largest = 10 ** torch.linspace(-6, 4, NUM, dtype=torch.float64)[:, None]  # of a gradient
+        for name, scale in {"parameter": 1.0, "mean": largest, "square": largest**2}.items():
+            error = (getattr(b, name).cpu() - getattr(a, name)).abs() / scale
+            assert error.max() <= 2e-6, name
+        assert torch.equal(b.parameter[-1].cpu(), first.parameter[-1])
+
+
+@pytest.mark.medium
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
+def test_all_kernels_compile(monkeypatch):
+    from asysplat.ops.adam.cuda import adam_step_cuda
+
+    kernels = collect_kernels(monkeypatch, 90, ["NUMBERS"])
+    adam_step_cuda(
+        make_tensors(), torch.ones(NUM, dtype=torch.bool), AdamSettings(0.9, 0.99, 1e-15)
+    )
+    names = ("drop_not_finite", "update_rows")
+    assert set(kernels) == {(name, numbers) for name in names for numbers in NUMBERS}
+    assert all(kernel.asm["cubin"] for kernel in kernels.values())
