@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.kernels.self_check import are_kernels_right
 
 Implementation = TypeVar("Implementation")
 KERNEL_BACKENDS = ("cpu", "cuda")  # the backends that run kernels; the others are written in torch
@@ -28,17 +29,20 @@ def look_up_backend(
     return backends[backend]
 
 
-def choose_fastest(x: Tensor, fallback: str) -> str:
-    """Return the name of the fastest backend for the device and dtype of x.
+def choose_fastest(x: Tensor, fallback: str, check: str) -> str:
+    """Return the name of the fastest backend for the device and dtype of x that is right there.
 
     Args:
         fallback: name of the backend in torch, which takes every device and dtype.
+        check: name of the function that checks the kernels on a GPU, see `are_kernels_right`.
     """
     if x.dtype == torch.float64:
         return fallback
     if x.device.type in ("cpu", "meta"):
         return "cpu"
-    return "cuda" if x.device.type == "cuda" and find_spec("triton") else fallback
+    if x.device.type != "cuda" or not find_spec("triton"):
+        return fallback
+    return "cuda" if are_kernels_right(check, x.device) else fallback
 
 
 def load_kernels(operator: str, backend: str) -> ModuleType:

@@ -79,7 +79,7 @@ class Scan:
         """
         self._check(inputs)
         if backend == "auto":
-            backend = choose_fastest(inputs.x, "chunked")
+            backend = choose_fastest(inputs.x, "chunked", f"asysplat.ops.self_check:{self.name}")
             if backend == "cuda" and (misfit := self._misfit(inputs)):
                 warnings.warn(f"{misfit}: computed by 'chunked', which is slower.", stacklevel=2)
                 backend = "chunked"

@@ -135,7 +135,8 @@ def render(
         if sh_degree is not None:
             scenes = replace(scenes, sh=scenes.sh[..., : (sh_degree + 1) ** 2, :])
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
-        auto = BACKENDS[choose_fastest(scenes.means, "reference")]
+        fastest = choose_fastest(scenes.means, "reference", "asysplat.rendering.self_check:render")
+        auto = BACKENDS[fastest]
         draw = look_up_backend("render", {"auto": auto, **BACKENDS}, backend)
         view_masks = None if masks is None else _one_batch(masks, batch)
         projected = centers = None

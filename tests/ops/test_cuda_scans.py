@@ -116,7 +116,7 @@ def test_sizes_that_kernels_cannot_take(name, sizes, message):
 
 @kernel
 def test_auto_takes_sizes_that_kernels_cannot_take(monkeypatch):
-    monkeypatch.setattr("asysplat.ops.scan.choose_fastest", lambda x, fallback: "cuda")
+    monkeypatch.setattr("asysplat.ops.scan.choose_fastest", lambda *arguments: "cuda")
     tensors = arguments("ssd", 3, head_dim=8)
     with pytest.warns(UserWarning, match="head_dim of 8: .* computed by 'chunked'"):
         got = run("ssd", tensors, "auto", False)

@@ -61,14 +61,18 @@ class CacheBySources(UserProvidedCacheLocator):
 def _cache_folder(parent: str) -> str:
     """Return the cache folder for this version of all sources, with or without bounds checks."""
     # Numba compares only the kernel's own file, not the files of the functions that it inlines.
-    paths = [path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")]
-    sources = b"".join(path.read_bytes() for path in sorted(paths))
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
-    name = f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}"
-    return str(Path(parent or _home_cache() or Path(__file__).parent / "__pycache__") / name)
+    name = f"kernels-{hash_sources()}{checks}"
+    return str(Path(parent or find_home_cache() or Path(__file__).parent / "__pycache__") / name)
 
 
-def _home_cache() -> Path | None:
+def hash_sources() -> str:
+    """Hash the sources of all kernels and of the functions that they call."""
+    paths = [path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(paths))).hexdigest()[:16]
+
+
+def find_home_cache() -> Path | None:
     """Return the user's cache folder; None where it cannot be written to."""
     folder = Path.home() / ".cache" / "asysplat"
     try:

@@ -24,7 +24,8 @@ def adam_step(tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: Ada
     Returns:
         The number of visible rows with a non-finite gradient.
     """
-    backends = {choose_fastest(rows.parameter, "reference") for rows in tensors}
+    check = "asysplat.ops.self_check:adam"
+    backends = {choose_fastest(rows.parameter, "reference", check) for rows in tensors}
     if backends == {"cpu"}:
         from asysplat.ops.adam.cpu import adam_step_cpu
 

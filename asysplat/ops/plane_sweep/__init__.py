@@ -32,7 +32,7 @@ def choose_backend(backend: str, x: Tensor) -> str:
     """
     look_up_backend("plane_sweep", dict.fromkeys(("auto", "reference", *KERNEL_BACKENDS)), backend)
     if backend == "auto":
-        return choose_fastest(x, "reference")
+        return choose_fastest(x, "reference", "asysplat.ops.self_check:plane_sweep")
     if backend != "reference":
         check_kernel_backend("plane_sweep", backend, x)
     return backend
