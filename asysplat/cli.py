@@ -96,7 +96,7 @@ def exit_with_message(stopped: str) -> Iterator[None]:
 
 
 def error_message(error: BaseException) -> str | None:
-    """Return the sentence of an InputError, a full disk or a lost loader; None for other errors.
+    """Return a sentence for an InputError, a full disk or memory, or a lost loader; else None.
 
     `error` may also have been raised from one of them.
     """
@@ -112,6 +112,12 @@ def error_message(error: BaseException) -> str | None:
             return (
                 f"a process that loads data was lost ({cause}); if memory was short, set "
                 "data.num_workers lower."
+            )
+        if isinstance(cause, MemoryError) or type(cause).__name__ == "OutOfMemoryError":  # torch's
+            reason = str(cause).partition(". GPU")[0] or "no reason given"
+            return (
+                f"there is no memory left ({reason}): choose fewer or smaller views, fewer "
+                "Gaussians or a smaller batch; docs/options.md names the options."
             )
         cause = cause_of(cause)
     return None

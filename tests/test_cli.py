@@ -4,6 +4,7 @@ import errno
 import os
 
 import pytest
+import torch
 
 from asysplat.cli import check_command, error_message
 from asysplat.errors import InputError
@@ -17,6 +18,11 @@ SENTENCES = {
     "a full disk": (FULL, "no space on the disk for logs/events (No space left on device)"),
     "a full disk behind": (FULL_AS_CAUSE, "no space on the disk"),
     "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no space on the disk (Disk quota"),
+    "a full GPU": (
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total"),
+        "no memory left (CUDA out of memory. Tried to allocate 2.00 GiB): choose fewer",
+    ),
+    "a full memory": (MemoryError(), "no memory left (no reason given): choose fewer"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }
 

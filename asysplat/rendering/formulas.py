@@ -100,7 +100,7 @@ def camera_rows(
     """Pack each camera into a row of float64; `size` is height and width in pixels."""
     poses = cam_to_world.detach().double().flatten(0, 1)
     pinhole = intrinsics.detach().double().flatten(0, 1)
-    focal, principal = pinhole[:, [0, 1], [0, 1]], pinhole[:, :2, 2]
+    focal, principal = pinhole.diagonal(dim1=1, dim2=2)[:, :2], pinhole[:, :2, 2]
     pixels = focal.new_tensor(size[::-1])
     margin = limits.frustum_margin * pixels
     low, high = (-principal - margin) / focal, (pixels - principal + margin) / focal
