@@ -46,12 +46,15 @@ def benchmark(options: DictConfig) -> None:
     figure = suite.plot(results) if hasattr(suite, "plot") else None
     for file in write_results(results, tables, figure, path):
         console.print(f"written: {file}", soft_wrap=True)
-    comparison = None if old is None else compare(old, results, suite.TRACKED)
-    for line in [] if comparison is None else comparison.lines():
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    worse = False
+    if old is not None:
+        comparison = compare(old, results, suite.TRACKED)
+        for line in comparison.lines():
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
+        worse = bool(comparison.worse)
     if hasattr(suite, "verdict") and (message := suite.verdict(results)):
         sys.exit(message)
-    if comparison is not None and comparison.worse:
+    if worse:
         sys.exit(1)
 
 

@@ -48,8 +48,8 @@ class TrackedMetrics(NamedTuple):
 
     names: tuple[str, ...]  # keys whose values name a row
     must_match: tuple[str, ...]  # paths to what two rows must have in common besides: sizes
-    # Paths to a number, to a median with its interquartile range, or to a dictionary of numbers,
-    # of which the largest is compared.
+    # Paths to a number, to a median with its interquartile range, or to a dictionary of numbers;
+    # the largest number of a dictionary is compared.
     kinds: Mapping[str, Kind]
     rows: str = "rows"  # key of the rows in the results
 

@@ -115,7 +115,7 @@ def _run(operator, args, kwargs):
     wrapped = {id(x.inner): x for x in tensors if isinstance(x, Pretended)}
     on_cpu = [x for x in tensors if not isinstance(x, Pretended) and x.ndim]
     if any(x.is_meta for x in on_cpu):
-        raise NotImplementedError(f"{operator} got a tensor made below what a mode sees")
+        raise RuntimeError(f"{operator} got a tensor made below what a mode sees")
     if wrapped and on_cpu and operator not in MIXING:
         raise RuntimeError(f"{operator} got tensors on {DEVICE} and on the CPU")
     pretended = isinstance(tensors[0], Pretended) if tensors else False

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from asysplat import ops
 from asysplat.kernels.self_check import relative_error, seeded_normal
 
 TOKENS = 150  # no multiple of a chunk
@@ -15,16 +16,12 @@ TOKENS = 150  # no multiple of a chunk
 
 def ssd(device: torch.device) -> float:
     """Compare y and all gradients with those of the chunked form in float64."""
-    from asysplat.ops import ssd
-
-    return _compare_scan(ssd, device, channels=(2, 64), decays=(2,), state=64)
+    return _compare_scan(ops.ssd, device, channels=(2, 64), decays=(2,), state=64)
 
 
 def selective_scan(device: torch.device) -> float:
     """Compare y and all gradients with those of the chunked form in float64."""
-    from asysplat.ops import selective_scan
-
-    return _compare_scan(selective_scan, device, channels=(64,), decays=(64, 16), state=16)
+    return _compare_scan(ops.selective_scan, device, channels=(64,), decays=(64, 16), state=16)
 
 
 def adam(device: torch.device) -> float:

@@ -5,7 +5,6 @@ import ctypes
 import gzip
 import os
 from functools import partial
-from pathlib import Path
 
 import pytest
 from damage import check_reader, damaged, damaged_zip, variants
@@ -13,6 +12,7 @@ from plyfile import PlyData
 
 from asysplat import read_gaussians, write_gaussians
 from asysplat.errors import InputError
+from asysplat.evaluation.measured_cost import peak_memory_gb, reset_peak_memory
 from asysplat.export.formats.spz import write_spz
 from asysplat.export.gaussians import Notes
 
@@ -65,16 +65,11 @@ def test_a_damaged_file_is_read_or_refused_in_one_sentence(files, tmp_path, name
 def peak_memory(path):
     """Bytes by which reading a file raises the resident memory of this process."""
     ctypes.CDLL(None).malloc_trim(0)  # else the read reuses what earlier ones left
-    Path("/proc/self/clear_refs").write_text("5")  # sets VmHWM, the peak, to VmRSS
-    before = _status("VmRSS")
+    reset_peak_memory("cpu")
+    before = peak_memory_gb("cpu")
     with contextlib.suppress(InputError):
         read_gaussians(path)
-    return _status("VmHWM") - before
-
-
-def _status(name):
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+    return 1e9 * (peak_memory_gb("cpu") - before)
 
 
 @pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="needs Linux's /proc")

@@ -48,8 +48,9 @@ def test_visible_rows_with_finite_gradients_are_those_of_the_reference(settings)
         assert adam_step_cuda(ours, visible.to(DEVICE), settings) == dropped == (step in (2, 3))
     for a, b, first in zip(exact, ours, begin, strict=True):
         assert torch.equal(a.steps, b.steps.cpu()) and a.steps.max() == 5
-        largest = 10 ** torch.linspace(-6, 4, NUM, dtype=torch.float64)[:, None]  # of a gradient
-        for name, scale in {"parameter": 1.0, "mean": largest, "square": largest**2}.items():
+        gradient_sizes = 10 ** torch.linspace(-6, 4, NUM, dtype=torch.float64)[:, None]
+        scales = {"parameter": 1.0, "mean": gradient_sizes, "square": gradient_sizes**2}
+        for name, scale in scales.items():
             error = (getattr(b, name).cpu() - getattr(a, name)).abs() / scale
             assert error.max() <= 2e-6, name
         assert torch.equal(b.parameter[-1].cpu(), first.parameter[-1])

@@ -1,7 +1,6 @@
 """What a refinement calls to add, move and remove Gaussians."""
 
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.scene import Cameras, Gaussians, Views
@@ -32,15 +31,3 @@ class Densifier:
             views: input views.
             target: number of Gaussians after this round, on an even growth to the limit.
         """
-
-
-def random_permutation(count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
-    """Sample a permutation on the generator's device."""
-    return torch.randperm(count, generator=generator, device=generator.device)
-
-
-def random_normal(
-    rows: int, columns: int, generator: torch.Generator
-) -> Float[Tensor, "rows columns"]:
-    """Sample standard normal numbers on the generator's device."""
-    return torch.randn(rows, columns, generator=generator, device=generator.device)

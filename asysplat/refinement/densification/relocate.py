@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
-from asysplat.refinement.densification.densifier import Densifier, random_normal
+from asysplat.refinement.densification.densifier import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
+from asysplat.refinement.sampling import random_normal
 from asysplat.scene import Gaussians, Views
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale

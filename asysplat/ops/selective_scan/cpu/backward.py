@@ -40,7 +40,8 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
     decays = np.empty(ROWS, np.float32)
     states = np.empty((CACHE_CHUNK + 1, LANES), np.float32)
     g_steps, g_added = np.empty(ROWS, np.float32), np.empty(ROWS, np.float32)
-    g_states = np.empty((blocks, state_size, LANES), np.float32)  # of the states before a chunk
+    # Gradients of the states before a chunk
+    g_states = np.empty((blocks, state_size, LANES), np.float32)
     while start < stop:
         batch, first_block = start // blocks, start % blocks
         last_block = min(blocks, first_block + stop - start)
