@@ -65,7 +65,8 @@ def reconstruct(config: DictConfig) -> None:
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, Console())
     photographs = open_photographs(config.path, **options)
-    find_views(config.video, photographs)  # an error of names comes before the work
+    # an error of names comes before the work
+    find_views(config.video, photographs.input_files, photographs.held_out_files)
     print(describe(config, photographs, limit))
     photographs = photographs.to(device)
     gaussians = initialize(config, photographs, settings)

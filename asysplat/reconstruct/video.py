@@ -44,7 +44,7 @@ def check_video(video: DictConfig) -> None:
         )
 
 
-def find_views(video: DictConfig, photographs: Photographs) -> list[int]:
+def find_views(video: DictConfig, inputs: Sequence[str], held_out: Sequence[str]) -> list[int]:
     """Find the views that the camera path passes, in its order, among the inputs and held-out ones.
 
     A photograph is named by its file, or by the end of its path where files share a name.
@@ -52,7 +52,6 @@ def find_views(video: DictConfig, photographs: Photographs) -> list[int]:
     Raises:
         InputError: a name of none of the photographs used, or of several.
     """
-    inputs, held_out = photographs.input_files, photographs.held_out_files
     if isinstance(video.path, str):
         return list(range(len(inputs)))
     return [_find_view(name, [*inputs, *held_out]) for name in video.path]
@@ -77,7 +76,9 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """
     frames = max(1, round(video.seconds * video.fps))
-    cameras = photographs.cameras.select(find_views(video, photographs))
+    cameras = photographs.cameras.select(
+        find_views(video, photographs.input_files, photographs.held_out_files)
+    )
     if video.path == "orbit":
         path = orbit(cameras, frames, subject(gaussians, cameras), gaussians)
     else:
