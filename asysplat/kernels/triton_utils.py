@@ -12,7 +12,7 @@ INTERPRETED = triton.knobs.runtime.interpret  # True in tests on a CPU, where Nu
 FUSED = {"enable_fp_fusion": True}
 # Sizes that change within a run, as Gaussians are added and views are selected. Triton would
 # compile a kernel again whenever one becomes 1, a multiple of 16 or neither.
-CHANGING = {"num", "num_visible", "num_splats", "views", "length", "chunks"}
+CHANGING = {"num", "num_visible", "num_splats", "views", "first", "length", "chunks"}
 
 
 def kernel(function: Callable) -> Callable:

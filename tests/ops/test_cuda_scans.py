@@ -1,9 +1,14 @@
 """The Triton scans against the reference in float64: on a GPU, or in Triton's interpreter."""
 
+import weakref
+from collections import defaultdict
+from importlib import import_module
+
 import pytest
 import torch
 from compiler import DEVICE, INTERPRETED, kernel
 from scans import NAMES, SCANS, make_arguments
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from asysplat.errors import InputError
 
@@ -47,6 +52,52 @@ OWN = {"y": 2, "x": 2, "dt": 2, "A": 0, "B": None, "C": None, "D": 0}
 @pytest.mark.parametrize("chunks, more", [(0, 1), (1, 0), (3, 5)])
 def test_output_and_gradients_equal_the_reference(name, chunks, more, reverse):
     check(name, arguments(name, chunks * CHUNKS[name] + more), reverse)
+
+
+@kernel
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("length", [32, 77])
+def test_a_selective_scan_in_segments_equals_the_reference(monkeypatch, length, reverse):
+    scan = import_module("asysplat.ops.selective_scan.cuda.scan")
+    monkeypatch.setattr(scan, "SEGMENT", 1)
+    monkeypatch.setattr(scan, "SHORTEST", 16)
+    check("selective_scan", arguments("selective_scan", length), reverse)
+
+
+def test_a_selective_scan_takes_memory_in_proportion_to_its_inputs(monkeypatch):
+    """On the meta device, where no kernel runs: allocations without contents."""
+    scan = import_module("asysplat.ops.selective_scan.cuda.scan")
+    for name in ("sum_chunk", "pass_states", "forward_chunk", "backward_chunk"):
+        monkeypatch.setattr(scan, name, defaultdict(lambda: lambda *_, **__: None))
+    peaks = []
+    for length in (2**17, 2**18):
+        x, B = (torch.empty(1, length, size, device="meta") for size in (512, 256))
+        inputs = scan.ScanInputs(x, x, x.new_empty(512, 256), B, B, x.new_empty(512))
+        with LiveNumbers() as numbers:
+            scan.backward(x, inputs, scan.forward(inputs, reverse=False, keep=True)[1], False)
+        peaks.append(numbers.peak)
+    inputs_and_gradients = 2**17 * 2 * (512 + 256)
+    assert peaks[1] - peaks[0] < 2 * inputs_and_gradients
+    assert peaks[0] < 2 * inputs_and_gradients + 3 * scan.SEGMENT
+
+
+class LiveNumbers(TorchDispatchMode):
+    """Count the numbers of all tensors created within; `peak` is the most that lived at once."""
+
+    def __init__(self):
+        super().__init__()
+        self.live = self.peak = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        if isinstance(out, torch.Tensor) and not func.is_view and all(out is not a for a in args):
+            self.live += out.numel()
+            self.peak = max(self.peak, self.live)
+            weakref.finalize(out, self.release, out.numel())
+        return out
+
+    def release(self, count):
+        self.live -= count
 
 
 @kernel

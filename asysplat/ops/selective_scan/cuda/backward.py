@@ -28,6 +28,7 @@ def backward_chunk(
     grad_B,
     grad_C,
     grad_D,
+    first,
     length,
     channels,
     REVERSE: tl.constexpr,
@@ -38,6 +39,7 @@ def backward_chunk(
     """Write the gradients for a chunk and a block of channels.
 
     The caller sums those of A and D over sequences and chunks, and those of B and C over blocks.
+    The latter are in the order of the scan.
 
     Args:
         grad_output, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
@@ -45,7 +47,8 @@ def backward_chunk(
         grad_states: [B, chunks, D, N] gradients of the states after each chunk.
         grad_x, grad_dt: [B, L, D].
         grad_A, grad_D: [B, chunks, D, N] and [B, chunks, D].
-        grad_B, grad_C: [B, L, blocks, N].
+        grad_B, grad_C: [B, chunks * CHUNK, blocks, N].
+        first: position of the segment's first token.
     """
     batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
@@ -54,7 +57,7 @@ def backward_chunk(
     state = tl.load(states + row * STATE + entry, mask=exists[:, None], other=0.0)
     before = (state,)
     for k in tl.static_range(CHUNK - 1):
-        position = chunk * CHUNK + k
+        position = first + chunk * CHUNK + k
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(x, token, limit, channel)
@@ -66,7 +69,8 @@ def backward_chunk(
     total_A = tl.zeros_like(rate)
     total_D = tl.zeros_like(skip)
     for k in tl.static_range(CHUNK):
-        position = chunk * CHUNK + (CHUNK - 1 - k)
+        place = chunk * CHUNK + (CHUNK - 1 - k)
+        position = first + place
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(x, token, limit, channel)
@@ -85,13 +89,10 @@ def backward_chunk(
         tl.store(grad_x + token + channel, result, mask=channel < limit)
         grad_step = tl.sum(grad_exponent * rate, 1) + value * grad_input
         tl.store(grad_dt + token + channel, grad_step, mask=channel < limit)
-        parts = tl.num_programs(1) * STATE
-        part, limit = row_at(batch, position, length, parts, REVERSE)
-        entries = tl.program_id(1) * STATE + tl.arange(0, STATE)
-        projection = tl.sum(grad_state * (step * value)[:, None], 0)
-        tl.store(grad_B + part + entries, projection, mask=entries < limit)
-        projection = tl.sum(state * out[:, None], 0)
-        tl.store(grad_C + part + entries, projection, mask=entries < limit)
+        part = (batch * tl.num_programs(0) * CHUNK + place) * tl.num_programs(1)
+        entries = (part + tl.program_id(1)) * STATE + tl.arange(0, STATE)
+        tl.store(grad_B + entries, tl.sum(grad_state * (step * value)[:, None], 0))
+        tl.store(grad_C + entries, tl.sum(state * out[:, None], 0))
         grad_state *= decay
     tl.store(grad_A + row * STATE + entry, total_A, mask=exists[:, None])
     tl.store(grad_D + row + channel, total_D, mask=exists)

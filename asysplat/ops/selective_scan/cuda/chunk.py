@@ -7,7 +7,10 @@ from asysplat.kernels.triton_utils import kernel, tokens_at
 
 @kernel
 def locate(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
-    """Return sequence, chunk, channels, which of them exist, and their states' places in [D, N]."""
+    """Return sequence, chunk of the segment, channels, which exist, their states' places in [D, N].
+
+    Shapes: scalars, [BLOCK], [BLOCK], [BLOCK, STATE].
+    """
     chunk = tl.program_id(0)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(2).to(tl.int64)

@@ -25,6 +25,7 @@ def sum_chunk(
     projections,
     states,
     steps,
+    first,
     length,
     channels,
     GRADIENT: tl.constexpr,
@@ -39,13 +40,14 @@ def sum_chunk(
         values, projections: x [B, L, D] and B [B, L, N]; with GRADIENT, grad_output and C.
         states: [B, chunks, D, N], written: what the tokens add.
         steps: [B, chunks, D], written: the sum of dt.
+        first: position of the segment's first token.
     """
     batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
     state = tl.zeros_like(rate)
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(CHUNK):
-        position = chunk * CHUNK + (CHUNK - 1 - k if GRADIENT else k)
+        position = first + chunk * CHUNK + (CHUNK - 1 - k if GRADIENT else k)
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(values, token, limit, channel)
@@ -66,6 +68,7 @@ def pass_states(
     A,
     steps,
     states,
+    carry,
     chunks,
     channels,
     GRADIENT: tl.constexpr,
@@ -75,12 +78,17 @@ def pass_states(
     """Replace each chunk's addition by the state before the chunk; see `sum_chunk`.
 
     With GRADIENT, replace it by the gradient of the state after the chunk.
+
+    Args:
+        carry: [B, D, N], the state before the segment, or the gradient after it; the other end's is
+            written.
     """
     entry = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(1).to(tl.int64)
     size = channels * STATE
     rate = tl.load(A + entry, mask=entry < size, other=0.0)
-    state = tl.zeros((BLOCK,), tl.float32)
+    place = carry + batch * size + entry
+    state = tl.load(place, mask=entry < size, other=0.0)
     for start in range(0, chunks, AHEAD):
         # All loads come first, so that they overlap.
         added, totals = (), ()
@@ -93,6 +101,7 @@ def pass_states(
             row, limit = row_at(batch, start + k, chunks, size, GRADIENT)
             tl.store(states + row + entry, state, mask=entry < limit)
             state = tl.exp(totals[k] * rate) * state + added[k]
+    tl.store(place, state, mask=entry < size)
 
 
 @kernel
@@ -105,6 +114,7 @@ def forward_chunk(
     D,
     states,
     y,
+    first,
     length,
     channels,
     REVERSE: tl.constexpr,
@@ -117,6 +127,7 @@ def forward_chunk(
     Args:
         x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
         states: [B, chunks, D, N] states before each chunk.
+        first: position of the segment's first token.
     """
     batch, chunk, channel, exists, entry = locate(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
@@ -124,7 +135,7 @@ def forward_chunk(
     row = (batch * tl.num_programs(0) + chunk) * channels
     state = tl.load(states + row * STATE + entry, mask=exists[:, None], other=0.0)
     for k in tl.static_range(CHUNK):
-        position = chunk * CHUNK + k
+        position = first + chunk * CHUNK + k
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(x, token, limit, channel)
