@@ -119,11 +119,11 @@ def load_camera(camera):
 
 @kernel
 def direction(offset):
-    """Compute the square of an offset, its length, and its direction in float32."""
-    square = dot(offset, offset)
+    """Compute the square of an offset, its length and its direction, in float32."""
+    x, y, z = offset[0].to(tl.float32), offset[1].to(tl.float32), offset[2].to(tl.float32)
+    square = x * x + y * y + z * z
     length = tl.sqrt(tl.maximum(square, MIN_SQUARED_DISTANCE))
-    x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
-    return square, length, x.to(tl.float32), y.to(tl.float32), z.to(tl.float32)
+    return square, length, x / length, y / length, z / length
 
 
 @kernel

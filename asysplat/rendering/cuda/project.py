@@ -83,7 +83,7 @@ def project(
         opacity *= tl.sqrt(tl.maximum(det0 / det, compensation_min))
     x = tangents[0] * focal[0] + tl.load(camera + CX)
     y = tangents[1] * focal[1] + tl.load(camera + CY)
-    log_opacity = tl.log2(opacity)
+    log_opacity = tl.log2(opacity.to(tl.float32))
     room = EXPONENT_MARGIN - log_alpha_min
     if CULL_EXTENT:
         room += log_opacity

@@ -1,4 +1,4 @@
-"""Compute gradients of Gaussians and cameras from those of their splats, in float64."""
+"""Compute gradients of Gaussians and cameras from those of their splats."""
 
 import math
 
@@ -24,7 +24,6 @@ from asysplat.rendering.cuda.math import (
     dot,
     ellipse_rows,
     ellipse_rows_gradient,
-    load1,
     load3,
     load_camera,
     plus,
@@ -42,6 +41,9 @@ from asysplat.rendering.cuda.splat import COLUMNS, GRADIENT
 
 LOG_2 = tl.constexpr(math.log(2))
 WHITEN_GRADIENT = tl.constexpr(math.log(2) * formulas.WHITEN_TO_LOG2)
+# The determinants of covariances, in pixels^4, whose gradients fit float32; a Gaussian beyond, of less
+# than 1e-7 or more than 1e7 pixels, does not change its shape.
+MIN_DETERMINANT, MAX_DETERMINANT = tl.constexpr(1e-28), tl.constexpr(1e28)
 PAIRS = tl.constexpr(8)  # pairs of a splat that are loaded at a time
 
 
@@ -58,13 +60,19 @@ def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLO
     first = tl.load(first_pair + d, mask=multiple, other=0).to(tl.int64)
     column = tl.arange(0, COLUMNS)[None, :]
     row = grads + GRADIENT * first[:, None] + column
-    total = tl.zeros((BLOCK, COLUMNS), tl.float64)
+    total = tl.zeros((BLOCK, COLUMNS), tl.float32)
+    error = tl.zeros((BLOCK, COLUMNS), tl.float32)
     for start in range(0, tl.max(count, 0), PAIRS):
         for k in tl.static_range(PAIRS):  # loads of 8 pairs are on their way at a time
             pair = start + k
             valid = (pair < count)[:, None] & (column < CHANNELS)
-            total += tl.load(row + GRADIENT * pair, mask=valid, other=0.0).to(tl.float64)
-    tl.store(row, total.to(tl.float32), mask=multiple[:, None] & (column < CHANNELS))
+            value = tl.load(row + GRADIENT * pair, mask=valid, other=0.0)
+            # The rounding error of each sum (Knuth 1969, TwoSum).
+            before = total
+            total = before + value
+            added = total - before
+            error += (before - (total - added)) + (value - added)
+    tl.store(row, total + error, mask=multiple[:, None] & (column < CHANNELS))
 
 
 @kernel
@@ -105,7 +113,7 @@ def project_backward(
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = n < num
     g = scene * num + n
-    zero = tl.zeros(n.shape, tl.float64)
+    zero = tl.zeros(n.shape, tl.float32)
     g_mean, g_scale, g_quat = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero, zero)
     g_opacity = zero
     for view in range(views):
@@ -148,13 +156,32 @@ def project_backward(
 def load_splat_grads(grads, first, drawn, HAS_DEPTH: tl.constexpr):
     """Read the gradients of splats from those of their first pairs, see `sum_pairs`."""
     row = grads + GRADIENT * first
-    out = (load1(row, 0, drawn), load1(row, 1, drawn), load1(row, 2, drawn), load1(row, 3, drawn))
-    out = out + (load1(row, 4, drawn), load1(row, 5, drawn), load1(row, 6, drawn))
-    out = out + (load1(row, 7, drawn), load1(row, 8, drawn))
+    out = ()
+    for k in tl.static_range(10 if HAS_DEPTH else 9):
+        out = out + (tl.load(row + k, mask=drawn, other=0.0),)
     if HAS_DEPTH:
-        return out + (load1(row, 9, drawn),)
+        return out
     else:
         return out + (tl.zeros_like(out[0]),)
+
+
+@kernel
+def to_float32(values):
+    """Round numbers to float32."""
+    rounded = ()
+    for k in tl.static_range(len(values)):
+        rounded = rounded + (values[k].to(tl.float32),)
+    return rounded
+
+
+@kernel
+def keep_where(condition, values):
+    """Return three numbers where the condition holds, else zeros."""
+    return (
+        tl.where(condition, values[0], 0.0),
+        tl.where(condition, values[1], 0.0),
+        tl.where(condition, values[2], 0.0),
+    )
 
 
 @kernel
@@ -170,7 +197,7 @@ def add_where(total, drawn, part):
 @kernel
 def store_sum(grad_cameras, camera_offset, values, drawn):
     """Store the sum of `values` where `drawn`."""
-    tl.store(grad_cameras + camera_offset, tl.sum(tl.where(drawn, values, 0.0), 0))
+    tl.store(grad_cameras + camera_offset, tl.sum(tl.where(drawn, values, 0.0).to(tl.float64), 0))
 
 
 @kernel
@@ -204,7 +231,8 @@ def splat_backward(
     """
     means, quats, scales, opacities, sh = inputs
     g_x, g_y, g_a, g_b, g_c, g_log_opacity, g_red, g_green, g_blue, g_z = splat_grads
-    # Repeat the forward pass.
+    # Repeat the forward pass. Differences cancel in it, so it is in float64. The gradients need not
+    # be as exact, and most GPUs compute float64 at 1/64 of the rate of float32.
     mean, scale = load3(means, g, drawn), load3(scales, g, drawn)
     quat = unit_quaternion(quats, g, drawn)
     axes, center, focal, limits = load_camera(camera)
@@ -213,9 +241,16 @@ def splat_backward(
     )
     mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
     _, xy, yy, _, det0, det = covariance(mx, my, eps2d)
+    in_range = (det > MIN_DETERMINANT) & (det < MAX_DETERMINANT)
+    quat, scale, offset = to_float32(quat), to_float32(scale), to_float32(offset)
+    axes = (to_float32(axes[0]), to_float32(axes[1]), to_float32(axes[2]))
+    focal, row_x, row_y = to_float32(focal), to_float32(row_x), to_float32(row_y)
+    mx, my = to_float32(mx), to_float32(my)
+    xy, var_y, det0, det = to_float32((xy, yy + eps2d, det0, det))
+    projected = (offset, inverse_z.to(tl.float32), to_float32(tangents), to_float32(clamped))
 
     # Opacity, and antialiasing.
-    g_opacity = g_log_opacity / load1(opacities, g, drawn)
+    g_opacity = g_log_opacity / tl.load(opacities + g, mask=drawn, other=1.0).to(tl.float32)
     g_det = tl.zeros_like(det)
     g_det0 = tl.zeros_like(det)
     if ANTIALIASED:
@@ -226,12 +261,12 @@ def splat_backward(
 
     # Whitening, covariance, scale and rotation.
     g_abc = (WHITEN_GRADIENT * g_a, WHITEN_GRADIENT * g_b, WHITEN_GRADIENT * g_c)
-    abc = whitening(xy, yy + eps2d, det)
+    abc = whitening(xy, var_y, det)
     g_mx, g_my = covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps2d)
+    g_mx, g_my = keep_where(in_range, g_mx), keep_where(in_range, g_my)
     g_scale, g_quat, g_row_x, g_row_y = ellipse_rows_gradient(g_mx, g_my, quat, scale, row_x, row_y)
 
     # The Jacobian's rows, and center and depth.
-    projected = (offset, inverse_z, tangents, clamped)
     g_offset, g_axes, g_focal, g_principal = project_mean_gradient(
         (LOG_2 * g_x, LOG_2 * g_y, g_z), (g_row_x, g_row_y), (row_x, row_y), projected, axes, focal
     )
@@ -257,7 +292,7 @@ def splat_backward(
             g_value += g_blue * tl.load(coefficients + 2, mask=drawn, other=0.0).to(tl.float32)
             g_basis = g_basis + (g_value,)
         g_dx, g_dy, g_dz = sh_basis_gradient(dx, dy, dz, g_basis, COUNT)
-        g_direction = (g_dx.to(tl.float64), g_dy.to(tl.float64), g_dz.to(tl.float64))
+        g_direction = (g_dx, g_dy, g_dz)
         g_offset = plus(g_offset, 1 / length, g_direction)
         radial = dot(offset, g_direction) / (length * length * length)
         g_offset = plus(g_offset, tl.where(square > MIN_SQUARED_DISTANCE, -radial, 0.0), offset)

@@ -123,7 +123,7 @@ def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
     if not CULL_ELLIPSE:
         return box_columns(ellipse, width)
     x, y, a, b, c, extent = ellipse
-    square = (c * extent) * (c * extent)
+    inverse_a, square = 1 / a, (c * extent) * (c * extent)
     tilt = b / c
     tip = -tilt / tl.sqrt(tilt * tilt + 1) * extent  # dy of the rightmost point
     low = (row * TILE).to(tl.float64) + (0.5 - PIXEL_MARGIN) - y
@@ -132,6 +132,6 @@ def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
     right_dy = tl.minimum(tl.maximum(tip, low), high)
     left_dy = tl.minimum(tl.maximum(-tip, low), high)
     right_v, left_v = c * right_dy, c * left_dy
-    right = (tl.sqrt(tl.maximum(square - right_v * right_v, 0.0)) - b * right_dy) / a
-    left = (-tl.sqrt(tl.maximum(square - left_v * left_v, 0.0)) - b * left_dy) / a
+    right = (tl.sqrt(tl.maximum(square - right_v * right_v, 0.0)) - b * right_dy) * inverse_a
+    left = (-tl.sqrt(tl.maximum(square - left_v * left_v, 0.0)) - b * left_dy) * inverse_a
     return tile_range(x, left, right, width)
