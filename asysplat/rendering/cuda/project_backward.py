@@ -41,8 +41,8 @@ from asysplat.rendering.cuda.splat import COLUMNS, GRADIENT
 
 LOG_2 = tl.constexpr(math.log(2))
 WHITEN_GRADIENT = tl.constexpr(math.log(2) * formulas.WHITEN_TO_LOG2)
-# The determinants of covariances, in pixels^4, whose gradients fit float32; a Gaussian beyond, of less
-# than 1e-7 or more than 1e7 pixels, does not change its shape.
+# The determinants of covariances, in pixels^4, whose gradients fit float32; a Gaussian beyond, of
+# less than 1e-7 or more than 1e7 pixels, does not change its shape.
 MIN_DETERMINANT, MAX_DETERMINANT = tl.constexpr(1e-28), tl.constexpr(1e28)
 PAIRS = tl.constexpr(8)  # pairs of a splat that are loaded at a time
 

@@ -143,10 +143,15 @@ def _choose_products(x: Tensor, B: Tensor) -> tuple[int, dict[str, Any]]:
     if x.dtype == torch.bfloat16:
         return TOKENS, BFLOAT16
     sizes_fit = x.shape[-1] == TF32_HEAD_DIM and B.shape[-1] >= TF32_STATE
-    if x.is_cuda and torch.cuda.get_device_capability(x.device) == HOPPER and sizes_fit:
+    if sizes_fit and _compute_capability(x) == HOPPER:
         return TOKENS, EXACT_BY_TF32
     # Exact products of chunks of TOKENS would not fit into registers.
     return max(16, TOKENS // 2), EXACT
+
+
+def _compute_capability(x: Tensor) -> tuple[int, int]:
+    """Return that of the tensor's GPU; (0, 0) if it has none."""
+    return torch.cuda.get_device_capability(x.device) if x.is_cuda else (0, 0)
 
 
 def _compute_decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:

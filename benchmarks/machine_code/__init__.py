@@ -1,0 +1,1 @@
+"""What Triton compiles the kernels to, for GPUs that are not at hand."""

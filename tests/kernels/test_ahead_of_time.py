@@ -1,0 +1,106 @@
+"""All kernels are compiled as they are launched, for GPUs that are not at hand.
+
+The interpreter takes what the compiler may not, and knows no registers.
+"""
+
+import ast
+
+import pytest
+
+pytest.importorskip("triton")
+
+from benchmarks.machine_code.cubin import (
+    LIMITS,
+    RESERVED_SHARED,
+    compile_launch,
+    count_instructions,
+    measure_usage,
+    without_repeats,
+)
+from benchmarks.machine_code.estimate import CARDS, estimate
+from benchmarks.machine_code.launches import record_launches
+
+SCANS = ("pass_states", "forward_chunk")
+KERNELS = {
+    "rendering": {"project", "list_tiles", "rasterize", "rasterize_backward", "sum_pairs"}
+    | {"project_backward"},
+    "plane_sweep": {"cost_band", "add_paths", "count_views"},
+    "selective_scan": {"sum_chunk", "backward_chunk", *SCANS},
+    "ssd": {"sum_decays", "score_chunk", "head_gradients", "score_gradients"}
+    | {"projection_gradients", *SCANS},
+    "adam": {"drop_not_finite", "update_rows"},
+}
+MAX_STACK = 256  # bytes of a thread: registers spilled to memory
+
+
+@pytest.mark.medium
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "capability",
+    [90, pytest.param(80, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.slow)],
+)
+def test_every_launch_compiles_and_fits(capability):
+    launches = without_repeats(record_launches(capability), capability)
+    names = {f"{package}.{name}" for package, names in KERNELS.items() for name in names}
+    assert {launch.name for launch in launches} == names
+    assert len(launches) < 90  # variants of kernels
+    for launch in launches:
+        usage = measure_usage(compile_launch(launch, capability), capability)
+        name = f"{launch.name} of {launch.case}"
+        assert usage.stack <= MAX_STACK, (name, usage)
+        assert usage.shared + RESERVED_SHARED <= LIMITS[capability].shared, (name, usage)
+        assert usage.occupancy > 0, (name, usage)
+        if launch.kernel_name in ("rasterize", "rasterize_backward", "sum_pairs"):
+            assert not any("float64" in counts for counts in usage.instructions), name
+
+
+SASS = """
+        /*0000*/                   MOV R1, c[0x0][0x28] ;
+.L_x_0:
+        /*0010*/                   LDG.E R2, [R4] ;
+.L_x_1:
+        /*0020*/                   DFMA R6, R2, R2, R6 ;
+        /*0030*/              @!P0 BRA `(.L_x_1) ;
+        /*0040*/               @P1 BRA `(.L_x_2) ;
+        /*0050*/              @!P2 BRA `(.L_x_0) ;
+.L_x_2:
+        /*0060*/                   MUFU.RCP R3, R2 ;
+        /*0070*/                   EXIT ;
+.L_x_3:
+        /*0080*/                   BRA `(.L_x_3);
+$__internal_0_$__cuda_sm20_div_rn_f64_full:
+        /*0090*/                   DMUL R2, R2, R2 ;
+"""
+
+
+def test_instructions_are_counted_by_loop():
+    outside, loop, inner = count_instructions(SASS)
+    assert outside == {"other": 3, "special": 1}
+    assert loop == {"memory": 1, "other": 2}
+    assert inner == {"float64": 1, "other": 1}
+
+
+def test_a_kernel_takes_as_long_as_its_slowest_resource():
+    card = CARDS["RTX 4090"]._replace(multiprocessors=10, clock=1e6)
+    counts = count_instructions(SASS)
+    seconds, bound = estimate(card, counts, (1.0, 2.0, 20.0), warps=100, traffic=0.0)
+    assert bound == "float64" and seconds == pytest.approx(20 * 16 * 100 / 10 / 1e6)
+    assert estimate(card, counts[:1], (1.0,), warps=1, traffic=1e12)[1] == "bytes"
+
+
+def test_kernels_unpack_no_tuple_within_a_tuple(repository):
+    """Triton 3.6, which torch 2.11 needs, does not read `(a, b), c = ...`."""
+    paths = [*(repository / "asysplat").rglob("cuda/*.py")]
+    kernels = [
+        node
+        for tree in (ast.parse(path.read_text()) for path in paths)
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and any(isinstance(name, ast.Name) and name.id == "kernel" for name in node.decorator_list)
+    ]
+    formulas = ast.parse((repository / "asysplat/rendering/formulas.py").read_text())
+    assert kernels
+    for node in ast.walk(ast.Module([*kernels, formulas], [])):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+            names = node.targets[0].elts
+            assert not any(isinstance(name, ast.Tuple) for name in names), ast.unparse(node)
