@@ -8,12 +8,14 @@ import hashlib
 import json
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +23,14 @@ from torch import Tensor
 TOLERANCE = 1e-3  # greatest relative error: rounding makes 1e-5, a wrong kernel far more
 MAX_REASON = 300  # characters of a compiler's message
 DRIVER = Path("/proc/driver/nvidia/version")
+Check = Callable[[torch.device, str], dict[str, float]]  # see `are_kernels_right`
+
+
+class KernelResults(NamedTuple):
+    """The results of an operator that are compared."""
+
+    outputs: Sequence[Tensor]
+    gradients: Sequence[Tensor] = ()
 
 
 def are_kernels_right(check: str, device: torch.device) -> bool:
@@ -29,8 +39,8 @@ def are_kernels_right(check: str, device: torch.device) -> bool:
     A verdict holds for one kind of GPU, driver, version of torch and Triton, and source.
 
     Args:
-        check: function as "module:name" that takes the device, runs an operator's kernels and their
-            reference, and returns the largest relative error.
+        check: function as "module:name" that takes a device and the name of a backend, runs an
+            operator's kernels and their reference, and returns `relative_errors`.
         device: GPU.
     """
     # Nothing can be compared while a compiler traces or a graph is captured.
@@ -63,13 +73,32 @@ def find_fault(check: str, device: torch.device) -> str:
     return fault
 
 
-def relative_error(outputs: Sequence[Tensor], exact: Sequence[Tensor]) -> float:
-    """Return the largest of the relative L2 errors of tensors; NaN where one has NaN."""
-    errors = [
-        (a.double() - b.double()).norm() / b.double().norm().clamp_min(1e-30)
-        for a, b in zip(outputs, exact, strict=True)
-    ]
-    return torch.stack(errors).max().item()
+def relative_errors(results: KernelResults, exact: KernelResults) -> dict[str, float]:
+    """Return the largest relative L2 errors of "outputs" and, where there are any, "gradients".
+
+    An error is NaN where a result has NaN.
+    """
+    errors = {}
+    for name, tensors, true in zip(KernelResults._fields, results, exact, strict=True):
+        norms = [
+            (a.double() - b.double()).norm() / b.double().norm().clamp_min(1e-30)
+            for a, b in zip(tensors, true, strict=True)
+        ]
+        if norms:
+            errors[name] = torch.stack(norms).max().item()
+    return errors
+
+
+def describe_errors(errors: Mapping[str, float]) -> str:
+    """Say how wrong kernels are; "" if no error exceeds TOLERANCE."""
+    wrong = [error for error in errors.values() if not error <= TOLERANCE]
+    return f"have a relative error of {max(wrong):.1e}" if wrong else ""
+
+
+def describe_failure(failure: Exception) -> str:
+    """Say that kernels do not run, with the first line of the reason."""
+    message = f"{type(failure).__name__}: {failure}".partition("\n")[0]
+    return f"do not run ({message[:MAX_REASON]})"
 
 
 def seeded_normal(device: torch.device, dtype: torch.dtype) -> Callable[..., Tensor]:
@@ -85,7 +114,7 @@ def describe_gpu(device: torch.device) -> str:
     return (
         f"{card.name} (compute capability {card.major}.{card.minor}, driver "
         f"{driver[0] if driver else 'unknown'}, torch {torch.__version__}, Triton "
-        f"{version('triton')})"
+        f"{version('triton') if find_spec('triton') else 'not installed'})"
     )
 
 
@@ -96,15 +125,13 @@ def _read_verdict(file: Path | None) -> str | None:
         return None
 
 
-def _compare(check: Callable[[torch.device], float], device: torch.device) -> str:
+def _compare(check: Check, device: torch.device) -> str:
     """Run a check; return what is wrong, or ""."""
     plain = torch.autocast(device.type, enabled=False)
     try:
         with torch.inference_mode(False), torch.enable_grad(), plain:
-            error = check(device)
+            return describe_errors(check(device, "cuda"))
     except torch.OutOfMemoryError:
         raise  # says nothing about the kernels
     except Exception as failure:  # compilers and drivers raise many kinds
-        message = f"{type(failure).__name__}: {failure}".partition("\n")[0]
-        return f"do not run ({message[:MAX_REASON]})"
-    return "" if error <= TOLERANCE else f"have a relative error of {error:.1e}"
+        return describe_failure(failure)

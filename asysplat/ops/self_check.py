@@ -1,36 +1,62 @@
-"""Small cases on which the operators' GPU kernels are compared with their references.
+"""Small cases on which the operators' kernels are compared with their references.
 
-Each function returns the largest relative error; see `asysplat.kernels.self_check`.
+Each function takes a device and the name of a backend, and returns the relative errors of outputs
+and gradients; see `asysplat.kernels.self_check`.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from asysplat import ops
-from asysplat.kernels.self_check import relative_error, seeded_normal
+from asysplat.kernels.dispatch import load_kernels
+from asysplat.kernels.self_check import KernelResults, relative_errors, seeded_normal
 
 TOKENS = 150  # no multiple of a chunk
+Sample = Callable[..., Tensor]
 
 
-def ssd(device: torch.device) -> float:
+def ssd(device: torch.device, backend: str) -> dict[str, float]:
     """Compare y and all gradients with those of the chunked form in float64."""
-    return _compare_scan(ops.ssd, device, channels=(2, 64), decays=(2,), state=64)
+    sample = partial(_sample_scan, channels=(2, 64), decays=(2,), state=64)
+    return _compare(ops.ssd, sample, device, (backend, "chunked"))
 
 
-def selective_scan(device: torch.device) -> float:
+def selective_scan(device: torch.device, backend: str) -> dict[str, float]:
     """Compare y and all gradients with those of the chunked form in float64."""
-    return _compare_scan(ops.selective_scan, device, channels=(64,), decays=(64, 16), state=16)
+    sample = partial(_sample_scan, channels=(64,), decays=(64, 16), state=16)
+    return _compare(ops.selective_scan, sample, device, (backend, "chunked"))
 
 
-def adam(device: torch.device) -> float:
+def grid_attention(device: torch.device, backend: str) -> dict[str, float]:
+    """Compare the output and all gradients, with sides that are no multiple of the grid's."""
+
+    def sample(draw: Sample) -> list[Tensor]:
+        return [draw(1, 3, 5, 4, 2, 16) for _ in "qkv"]
+
+    return _compare(partial(ops.grid_attention, grid=2), sample, device, (backend, "reference"))
+
+
+def image_loss(device: torch.device, backend: str) -> dict[str, float]:
+    """Compare the losses of two images and their gradients."""
+    target = seeded_normal(device, torch.float64)(2, 3, 33, 40).sigmoid()
+
+    def sample(draw: Sample) -> list[Tensor]:
+        return [draw(2, 3, 33, 40).tanh()]
+
+    loss = partial(ops.image_loss, target=target)
+    return _compare(loss, sample, device, (backend, "reference"))
+
+
+def adam(device: torch.device, backend: str) -> dict[str, float]:
     """Compare parameters and averages after two steps, with a row that is left out."""
-    from asysplat.ops.adam.cuda import adam_step_cuda
     from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 
+    kernels = getattr(load_kernels("adam", backend), f"adam_step_{backend}")
     settings, results = AdamSettings(0.9, 0.999, 1e-15), []
-    for step, dtype in ((adam_step_cuda, torch.float32), (adam_step_reference, torch.float64)):
+    for step, dtype in ((kernels, torch.float32), (adam_step_reference, torch.float64)):
         draw = seeded_normal(device, dtype)
         visible = draw(200) > 0
         rows = []
@@ -43,13 +69,14 @@ def adam(device: torch.device) -> float:
             rows.append(Rows(parameter, gradient, *state, steps, rates))
         for _ in range(2):
             step(rows, visible, settings)
-        results.append([tensor for row in rows for tensor in (row.parameter, row.mean, row.square)])
-    return relative_error(*results)
+        tensors = [tensor for row in rows for tensor in (row.parameter, row.mean, row.square)]
+        results.append(KernelResults(tensors))
+    return relative_errors(*results)
 
 
-def plane_sweep(device: torch.device) -> float:
+def plane_sweep(device: torch.device, backend: str) -> dict[str, float]:
     """Compare the costs, their contrasts and the counts of views."""
-    from asysplat.ops.plane_sweep import cuda, reference
+    from asysplat.ops.plane_sweep import reference
 
     draw = seeded_normal(device, torch.float32)
     neighbors = torch.tensor([[[1, 2], [0, 2], [1, -1]]], device=device)
@@ -59,28 +86,41 @@ def plane_sweep(device: torch.device) -> float:
     images, edges = draw(1, 3, 33, 40).sigmoid(), draw(1, 3, 2, 33, 40).sigmoid()
     inverse, trust = 0.2 + 0.8 * images, torch.ones_like(images)
     results = []
-    for backend in (cuda, reference):
-        costs = backend.cost_volume(images, neighbors, motions, ranges, 32)
-        best = backend.sgm(costs, trust, edges)
+    for module in (load_kernels("plane_sweep", backend), reference):
+        costs = module.cost_volume(images, neighbors, motions, ranges, 32)
+        best = module.sgm(costs, trust, edges)
         steps = torch.full((1, 3), 0.02, device=device)
-        counts = backend.consistency(inverse, steps, trust, neighbors, motions)
-        results.append([costs, best.contrast, *counts])
-    return relative_error(*results)
+        counts = module.consistency(inverse, steps, trust, neighbors, motions)
+        results.append(KernelResults([costs, best.contrast, *counts]))
+    return relative_errors(*results)
 
 
-def _compare_scan(
+def _sample_scan(
+    draw: Sample, channels: tuple[int, ...], decays: tuple[int, ...], state: int
+) -> list[Tensor]:
+    """Draw x, dt, A, B, C and D."""
+    x, B, C = draw(1, TOKENS, *channels), draw(1, TOKENS, state), draw(1, TOKENS, state)
+    dt, A = draw(1, TOKENS, channels[0]).sigmoid(), -draw(*decays).exp()
+    return [x, dt, A, B, C, draw(channels[0])]
+
+
+def _compare(
     operator: Callable[..., Tensor],
+    sample: Callable[[Sample], list[Tensor]],
     device: torch.device,
-    channels: tuple[int, ...],
-    decays: tuple[int, ...],
-    state: int,
-) -> float:
+    backends: tuple[str, str],
+) -> dict[str, float]:
+    """Compare the output and all gradients of an operator with those of its reference in float64.
+
+    Args:
+        sample: draws the inputs from a function that draws normal numbers.
+        backends: names of the backends of the kernels and of the reference.
+    """
     results = []
-    for backend, dtype in (("cuda", torch.float32), ("chunked", torch.float64)):
+    for backend, dtype in zip(backends, (torch.float32, torch.float64), strict=True):
         draw = seeded_normal(device, dtype)
-        x, B, C = draw(1, TOKENS, *channels), draw(1, TOKENS, state), draw(1, TOKENS, state)
-        dt, A = draw(1, TOKENS, channels[0]).sigmoid(), -draw(*decays).exp()
-        leaves = [tensor.requires_grad_() for tensor in (x, dt, A, B, C, draw(channels[0]))]
+        leaves = [tensor.requires_grad_() for tensor in sample(draw)]
         y = operator(*leaves, backend=backend)
-        results.append([y.detach(), *torch.autograd.grad(y, leaves, draw(*y.shape))])
-    return relative_error(*results)
+        gradients = torch.autograd.grad(y, leaves, draw(*y.shape))
+        results.append(KernelResults([y.detach()], gradients))
+    return relative_errors(*results)

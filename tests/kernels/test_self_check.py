@@ -17,7 +17,7 @@ OPERATORS = ("adam", "ssd", "selective_scan", "plane_sweep")
 CHECKS = [f"asysplat.ops.self_check:{name}" for name in OPERATORS]
 CHECKS += ["asysplat.rendering.self_check:render"]
 
-error = 0.0  # what the check `compare` returns, or an exception to be raised
+error = 0.0  # the error that the check `compare` returns, or an exception to be raised
 runs = 0
 
 
@@ -27,13 +27,13 @@ class OnGpu(torch.Tensor):
     device = GPU
 
 
-def compare(device):
+def compare(device, backend):
     global runs
     runs += 1
-    assert device == GPU and torch.is_grad_enabled()
+    assert (device, backend) == (GPU, "cuda") and torch.is_grad_enabled()
     if isinstance(error, Exception):
         raise error
-    return error
+    return {"outputs": 0.0, "gradients": error}
 
 
 @pytest.fixture
@@ -103,6 +103,13 @@ def test_our_kernels_are_right(check):
     assert self_check._compare(self_check.resolve_name(check), torch.device(DEVICE)) == ""
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize("check", [*CHECKS, "asysplat.ops.self_check:image_loss"])
+def test_kernels_of_the_processor_pass_the_same_checks(check):
+    errors = self_check.resolve_name(check)(torch.device("cpu"), "cpu")
+    assert 0 < max(errors.values()) < TOLERANCE / 10
+
+
 @kernel
 def test_a_flipped_sign_is_found(monkeypatch):
     from asysplat.ops import self_check as checks
@@ -110,4 +117,4 @@ def test_a_flipped_sign_is_found(monkeypatch):
 
     table, signs = cuda._corrections_on, torch.tensor([-1.0, 1.0], device=DEVICE)
     monkeypatch.setattr(cuda, "_corrections_on", lambda *arguments: signs * table(*arguments))
-    assert checks.adam(torch.device(DEVICE)) > 10 * TOLERANCE
+    assert checks.adam(torch.device(DEVICE), "cuda")["outputs"] > 10 * TOLERANCE
