@@ -1,5 +1,6 @@
 """Seconds and errors, measured in the same way in every suite."""
 
+import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,19 +34,24 @@ class Measurement:
 
 
 def time_in_rounds(
-    measurements: Sequence[Measurement], repeats: int, console: Console | None = None
+    measurements: Sequence[Measurement],
+    repeats: int,
+    console: Console | None = None,
+    seconds: float = math.inf,
 ) -> None:
     """Call every timer once in each of `repeats` rounds, after a round to warm up.
 
     Measurements take turns, so that other load on the machine affects all of them alike. Progress
-    is shown if there is a console.
+    is shown if there is a console. From the second round on, none begins after `seconds`.
     """
-    rounds = range(repeats + 1)
+    rounds, start = range(repeats + 1), time.perf_counter()
     for number in track(rounds, "rounds", console=console, transient=True, disable=not console):
+        if number > 1 and time.perf_counter() - start > seconds:
+            break
         for measurement in measurements:
-            for name, seconds in measurement.timer().items():
+            for name, duration in measurement.timer().items():
                 if number > 0:
-                    measurement.seconds.setdefault(name, []).append(seconds)
+                    measurement.seconds.setdefault(name, []).append(duration)
 
 
 def summarize(values: Sequence[float]) -> Result:

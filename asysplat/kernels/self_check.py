@@ -96,9 +96,8 @@ def describe_errors(errors: Mapping[str, float]) -> str:
 
 
 def describe_failure(failure: Exception) -> str:
-    """Say that kernels do not run, with the first line of the reason."""
-    message = f"{type(failure).__name__}: {failure}".partition("\n")[0]
-    return f"do not run ({message[:MAX_REASON]})"
+    """Return the type and the first line of an exception."""
+    return f"{type(failure).__name__}: {failure}".partition("\n")[0][:MAX_REASON]
 
 
 def seeded_normal(device: torch.device, dtype: torch.dtype) -> Callable[..., Tensor]:
@@ -134,4 +133,4 @@ def _compare(check: Check, device: torch.device) -> str:
     except torch.OutOfMemoryError:
         raise  # says nothing about the kernels
     except Exception as failure:  # compilers and drivers raise many kinds
-        return describe_failure(failure)
+        return f"do not run ({describe_failure(failure)})"
