@@ -50,7 +50,7 @@ CARDS = {
 }
 
 
-class Workload(NamedTuple):
+class RenderingWork(NamedTuple):
     """What the kernels of the renderer do for one image: programs, rounds of loops, and bytes.
 
     The first of a kernel's rounds is 1, for the instructions outside of its loops.
@@ -63,7 +63,7 @@ class Workload(NamedTuple):
 
 
 @torch.no_grad()
-def measure_workload(scene: Scene) -> Workload:
+def measure_workload(scene: Scene) -> RenderingWork:
     """Project a scene and list its tiles, by the reference, to count programs and rounds."""
     gaussians, cameras = (part.map(lambda tensor: tensor[None]) for part in scene)
     splats = project(gaussians, cameras, RenderSettings(depth=None))
@@ -80,7 +80,7 @@ def measure_workload(scene: Scene) -> Workload:
         name: float((lengths / step).ceil().mean())
         for name, step in (("rasterize", FORWARD_STEP), ("rasterize_backward", BACKWARD_STEP))
     }
-    return Workload(
+    return RenderingWork(
         programs={
             "project": math.ceil(num / BLOCK),
             "list_tiles": math.ceil(visible / BLOCK),

@@ -18,7 +18,7 @@ from benchmarks.timing import Result
 
 if TYPE_CHECKING:  # needs Triton
     from benchmarks.machine_code.cubin import Usage
-    from benchmarks.machine_code.estimate import Workload
+    from benchmarks.machine_code.estimate import RenderingWork
 
 TRACKED = TrackedMetrics(
     names=("capability", "kernel", "case"),
@@ -81,7 +81,7 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 
 def _estimate_kernel(
-    card: str, kernel: str, usages: list["Usage"], workload: "Workload"
+    card: str, kernel: str, usages: list["Usage"], workload: "RenderingWork"
 ) -> dict[str, Any]:
     """Add the estimates of a kernel's launches, each of which does the whole workload."""
     from benchmarks.machine_code.estimate import CARDS, estimate

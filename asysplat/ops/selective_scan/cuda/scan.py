@@ -84,8 +84,16 @@ def _add_gradients(
     grad_A, grad_D = torch.empty_like(states), states.new_empty(states.shape[:3])
     grad_B, grad_C = states.new_empty(2, batch, chunks * BACKWARD_CHUNK, blocks, size)
     backward_chunk[_grid(states)](
-        *(grad_output, *inputs, states, grad_states),
-        *(grads.x, grads.dt, grad_A, grad_B, grad_C, grad_D),
+        grad_output,
+        **inputs._asdict(),
+        states=states,
+        grad_states=grad_states,
+        grad_x=grads.x,
+        grad_dt=grads.dt,
+        grad_A=grad_A,
+        grad_B=grad_B,
+        grad_C=grad_C,
+        grad_D=grad_D,
         first=segment.start,
         length=grad_output.shape[1],
         channels=grad_output.shape[2],
@@ -122,7 +130,10 @@ def _compute_states(
     states = dt.new_empty(batch, chunks, channels, size)
     steps = dt.new_empty(batch, chunks, channels)
     sum_chunk[_grid(states)](
-        *(values, dt, A, projections, states, steps, segment.start, length, channels),
+        *(values, dt, A, projections, states, steps),
+        first=segment.start,
+        length=length,
+        channels=channels,
         GRADIENT=gradient,
         CHUNK=chunk,
         **_tile(states, reverse),
