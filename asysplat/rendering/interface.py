@@ -15,6 +15,8 @@ DEPTHS = ("accumulated", "expected", "median")
 MAX_MAGNITUDE = 1e18  # limit of depths and SH coefficients: more is culled, as squares overflow
 MAX_PAIRS = 2**31 - 1  # pairs of splat and tile that int32 can number
 MAX_SPLATS_PER_TILE = 2**24  # what float32 can count
+MAX_SPLATS = 2**31 - 1  # Gaussians of all views together that int32 can number
+MAX_IMAGES = 2**16 - 1  # views of all scenes that a GPU launches programs for
 
 
 def single(value: float) -> float:
@@ -180,4 +182,23 @@ def check_pairs(pairs: int, longest: int = 0) -> None:
         raise InputError(
             f"render needs {pairs} pairs of Gaussian and tile, and the limit is {MAX_PAIRS}: "
             "set views_at_once, or render smaller Gaussians."
+        )
+
+
+def check_splats(images: int, num: int) -> None:
+    """Raise InputError if a GPU cannot number the splats of so many images.
+
+    Args:
+        images: views of all scenes, at most MAX_IMAGES.
+        num: Gaussians of a scene; those of all images together are at most MAX_SPLATS.
+    """
+    if images > MAX_IMAGES:
+        raise InputError(
+            f"render draws {images} views at once, and the limit is {MAX_IMAGES}: set "
+            "views_at_once, or render fewer scenes."
+        )
+    if images * num > MAX_SPLATS:
+        raise InputError(
+            f"render projects {num} Gaussians to {images} views at once, and the limit is "
+            f"{MAX_SPLATS} in all: set views_at_once, or render fewer scenes."
         )

@@ -107,8 +107,8 @@ def render(
 
     Raises:
         InputError: an unknown backend or depth; incompatible shapes, devices or types; more pairs
-            of Gaussian and tile than a list can number; `projections` with `views_at_once`; with
-            `validate`, everything that
+            of Gaussian and tile, or of Gaussian and view, than a list can number; `projections`
+            with `views_at_once`; a CUDA graph being captured; with `validate`, everything that
             `Gaussians.validate` and `Cameras.validate` refuse.
 
     Example:
@@ -120,6 +120,11 @@ def render(
         >>> out.depth.shape
         torch.Size([4, 64, 64])
     """
+    if gaussians.means.is_cuda and torch.cuda.is_current_stream_capturing():
+        raise InputError(
+            "render waits for the GPU to count its splats, which a CUDA graph cannot hold: call it "
+            "outside torch.cuda.graph."
+        )
     if sh_degree not in (None, 0, 1, 2, 3):
         raise InputError(f"render's sh_degree is {sh_degree!r}: choose 0, 1, 2, 3 or None.")
     if validate:

@@ -236,6 +236,28 @@ def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
         draw_by_cuda(*make_batch(make_scene, device=DEVICE), RenderSettings())
 
 
+@kernel
+@pytest.mark.parametrize(
+    "limit, found", [("MAX_IMAGES", "2 views"), ("MAX_SPLATS", "12 Gaussians")]
+)
+def test_too_many_splats_are_an_error(make_scene, monkeypatch, limit, found):
+    monkeypatch.setattr(f"asysplat.rendering.interface.{limit}", 1)
+    with pytest.raises(InputError, match=rf"{found}.* 1[ :].*set views_at_once"):
+        draw_by_cuda(*make_batch(make_scene, views=2, device=DEVICE), RenderSettings())
+
+
+@kernel
+def test_indices_of_an_image_beyond_int32_are_right():
+    """The last tile of the second of two images of 40,000 x 40,000 pixels."""
+    from pixel_kernel import write_indices
+
+    side, columns = 40_000, 5000
+    out = torch.empty(4, 64, dtype=torch.int64, device=DEVICE)
+    write_indices[(1,)](out, 2 * columns**2 - 1, columns, columns**2, side, side)
+    planes = out[:, -1].tolist()
+    assert planes == [plane * side**2 - 1 for plane in (2, 4, 5, 6)]
+
+
 @pytest.mark.skipif(INTERPRETED, reason="a CPU will do there")
 def test_tensors_on_a_cpu_are_an_error(make_scene):
     pytest.importorskip("triton")

@@ -6,6 +6,7 @@ import pytest
 import torch
 from textbook import textbook_alphas
 
+from asysplat.errors import InputError
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.rendering import INRIA, render
 from asysplat.rendering.reference import rasterize
@@ -70,3 +71,12 @@ def test_any_tiles_and_groups_give_the_same_image(make_scene, monkeypatch):
     torch.testing.assert_close(run(), before)
     monkeypatch.setattr(rasterize, "TILE", 7)
     torch.testing.assert_close(run(), before)
+
+
+def test_a_render_in_a_cuda_graph_is_an_error(make_scene, monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
+    gaussians, cameras = make_scene(dtype=torch.float32)
+    gaussians.means.fill_(torch.nan)  # which is not looked at: that would wait
+    with pytest.raises(InputError, match=r"waits for the GPU.* call it outside torch.cuda.graph.$"):
+        render(gaussians, cameras, validate=True)

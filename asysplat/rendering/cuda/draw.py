@@ -24,7 +24,7 @@ from asysplat.rendering.formulas import (
     camera_rows,
     image_gradients,
 )
-from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
+from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs, check_splats
 from asysplat.scene import Cameras, Gaussians
 
 BLOCK = 128  # Gaussians of a program
@@ -53,13 +53,14 @@ def draw(
 
     Raises:
         InputError: tensors that are not on a GPU, unless Triton interprets its kernels
-            (TRITON_INTERPRET=1); more pairs of splat and tile than a list can number.
+            (TRITON_INTERPRET=1); more splats, or pairs of splat and tile, than a list can number.
     """
     if not (gaussians.means.is_cuda or INTERPRETED):
         raise InputError(
             f"render's backend is 'cuda' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cuda')."
         )
+    check_splats(math.prod(cameras.intrinsics.shape[:2]), gaussians.num_gaussians)
     return apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
 
 

@@ -118,8 +118,9 @@ def tile_window(tile, columns, tiles, height, width):
 @kernel
 def color_pixels(pixel, image, height, width):
     """Compute the indices of pixels in the three planes of an image from those in one plane."""
-    red = pixel + 2 * image * height * width
-    return red, red + height * width, red + 2 * height * width
+    plane = tl.cast(height, tl.int64) * width
+    red = pixel + 2 * image * plane
+    return red, red + plane, red + 2 * plane
 
 
 @kernel
