@@ -40,6 +40,7 @@ from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
 from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
 from asysplat.runs.runs import EVALUATION
 from asysplat.runs.summary import print_evaluation, write_json
@@ -57,9 +58,11 @@ def evaluate(options: DictConfig) -> None:
     config = target.config
     check_writable(target.scene_folder, "paths.logs")
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    try:  # the device and the precision of a prediction, as in the test of train.py
-        choices = {key: config.trainer[key] for key in ("accelerator", "precision")}
-        fabric = lightning.Fabric(devices=1, **choices)
+    # The device and the precision of a prediction, as in the test of train.py.
+    accelerator = find_accelerator(config.trainer.accelerator)
+    try:
+        precision = config.trainer.precision
+        fabric = lightning.Fabric(accelerator=accelerator, devices=1, precision=precision)
     except (ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {error}") from error
     measure = make_measure(config, options, fabric.device)

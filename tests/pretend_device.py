@@ -2,10 +2,11 @@
 
 What a GPU refuses is refused: tensors of both devices in one operator, numpy(), a generator of the
 other device. It shows a forgotten `.to(device)` on a machine without one. Its name is that of
-Apple's GPU, which has no kernels of ours.
+Graphcore's, which has no kernels of ours, or that of Apple's GPU, which has no float64 either.
 """
 
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -13,15 +14,17 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-DEVICE, META = torch.device("mps"), torch.device("meta")
+DEVICE, APPLE, META = torch.device("ipu"), torch.device("mps"), torch.device("meta")
 ATEN = torch.ops.aten
 # Indices and masks of a CPU are taken on any device, and a copy moves numbers.
 MIXING = {ATEN.index.Tensor, ATEN.index_put_.default, ATEN._index_put_impl_.default}
 MIXING |= {ATEN.copy_.default, ATEN._to_copy.default}
 
+_device = DEVICE
+
 
 class Pretended(Tensor):
-    """A tensor that says that it is on DEVICE."""
+    """A tensor that says that it is on the pretended device."""
 
     @staticmethod
     def __new__(cls, inner):
@@ -30,7 +33,7 @@ class Pretended(Tensor):
         tensor = torch.Tensor._make_wrapper_subclass(
             cls, inner.shape, dtype=inner.dtype, device="meta", **layout
         )
-        tensor.inner = inner
+        tensor.inner, tensor.says = inner, _device
         return tensor
 
     @classmethod
@@ -39,7 +42,7 @@ class Pretended(Tensor):
 
     @property
     def device(self):
-        return DEVICE
+        return self.says
 
     def __getitem__(self, index):
         indices = index if isinstance(index, tuple) else (index,)
@@ -60,7 +63,7 @@ class Pretended(Tensor):
 
 
 class Generator(torch.Generator):
-    """A generator that may say that it is on DEVICE."""
+    """A generator that may say that it is on the pretended device."""
 
     def __new__(cls, device="cpu"):
         generator = super().__new__(cls, "cpu")
@@ -73,13 +76,13 @@ class Generator(torch.Generator):
 
 
 class _AsMeta(TorchFunctionMode):
-    """Replaces DEVICE, which torch may not be built for, by meta in every call."""
+    """Replaces the device, which torch may not be built for, by meta in every call."""
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if function is torch.device:
             return function(*args, **kwargs)
-        if function in (torch.tensor, torch.as_tensor) and kwargs.get("device") == DEVICE:
+        if function in (torch.tensor, torch.as_tensor) and kwargs.get("device") == _device:
             # Torch moves the numbers below what a mode sees.
             return function(*args, **kwargs | {"device": "cpu"}).to(META)
         generator = kwargs.get("generator")
@@ -90,7 +93,7 @@ class _AsMeta(TorchFunctionMode):
             if generator.device != (like or torch.device(kwargs.get("device", "cpu"))):
                 raise RuntimeError(f"{function.__name__} got a generator of another device")
         args, kwargs = tree_map(
-            lambda leaf: META if isinstance(leaf, torch.device) and leaf == DEVICE else leaf,
+            lambda leaf: META if isinstance(leaf, torch.device) and leaf == _device else leaf,
             (args, kwargs),
         )
         return function(*args, **kwargs)
@@ -102,11 +105,14 @@ class _Pretend(TorchDispatchMode):
 
 
 @contextmanager
-def pretended_device(monkeypatch):
-    """Let torch create tensors on DEVICE."""
+def pretended_device(monkeypatch, device=DEVICE):
+    """Let torch create tensors on `device`."""
     monkeypatch.setattr(torch, "Generator", Generator)
+    monkeypatch.setitem(globals(), "_device", device)
+    if device == DEVICE:  # activation checkpointing asks for the device's module
+        monkeypatch.setattr(torch, device.type, SimpleNamespace(), raising=False)
     with _AsMeta(), _Pretend():
-        yield DEVICE
+        yield device
 
 
 def _run(operator, args, kwargs):
@@ -117,11 +123,11 @@ def _run(operator, args, kwargs):
     if any(x.is_meta for x in on_cpu):
         raise RuntimeError(f"{operator} got a tensor made below what a mode sees")
     if wrapped and on_cpu and operator not in MIXING:
-        raise RuntimeError(f"{operator} got tensors on {DEVICE} and on the CPU")
+        raise RuntimeError(f"{operator} got tensors on {_device} and on the CPU")
     pretended = isinstance(tensors[0], Pretended) if tensors else False
     pretended |= bool(wrapped) and operator not in MIXING
     if kwargs.get("device") is not None:
-        pretended = torch.device(kwargs["device"]).type in ("meta", DEVICE.type)
+        pretended = torch.device(kwargs["device"]).type in ("meta", _device.type)
         kwargs = kwargs | {"device": torch.device("cpu")}
     args, kwargs = tree_map(
         lambda leaf: leaf.inner if isinstance(leaf, Pretended) else leaf, (args, kwargs)
@@ -133,6 +139,8 @@ def _run(operator, args, kwargs):
     def wrap(leaf):
         if not isinstance(leaf, Tensor):
             return leaf
+        if _device == APPLE and leaf.dtype == torch.float64:
+            raise TypeError("Cannot convert a MPS Tensor to float64 dtype")  # torch's words
         return wrapped[id(leaf)] if id(leaf) in wrapped else Pretended(leaf)
 
     return tree_map(wrap, out)

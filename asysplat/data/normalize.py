@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.geometry.motion import transform
+from asysplat.kernels.precision import to_float64
 from asysplat.scene import Cameras, Gaussians, TensorRecord, Views
 
 
@@ -57,8 +58,11 @@ def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalizatio
     Returns:
         inputs and targets in the network's frame, and the transform; its scale is 1 if all inputs
         have the same position.
+
+    Raises:
+        InputError: views on a device without float64.
     """
-    poses = inputs.cameras.cam_to_world.double()
+    poses = to_float64(inputs.cameras.cam_to_world)
     centers = poses[:, :3, 3]
     mean_pose = torch.eye(4, dtype=poses.dtype, device=poses.device)
     forward, down = poses[:, :3, 2].mean(0), poses[:, :3, 1].mean(0)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from asysplat.geometry.spherical_harmonics import sh_rotation
+from asysplat.kernels.precision import to_float64
 from asysplat.scene import Gaussians
 
 
@@ -18,10 +19,14 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 
     Args:
         motion: from the Gaussians' frame to the new one.
+
+    Raises:
+        InputError: Gaussians on a device without float64.
     """
-    motion = motion.to(gaussians.means.device, torch.float64)
+    means = to_float64(gaussians.means)
+    motion = motion.to(means)
     rotation, translation = motion[:3, :3], motion[:3, 3]
-    means = gaussians.means.double() @ rotation.mT + translation
+    means = means @ rotation.mT + translation
     w, x, y, z = Rotation.from_matrix(rotation.cpu().numpy()).as_quat(scalar_first=True)
     product = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     quats = gaussians.quats.double() @ motion.new_tensor(product).mT

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.kernels.precision import to_float64
 from asysplat.refinement.isotropic import footprints
 from asysplat.scene import Cameras, Gaussians
 
@@ -58,7 +59,7 @@ def merge_to_limit(
     `pixels`, > 0, is the side of a cell in pixels of the view where these are smallest.
 
     Raises:
-        InputError: see `Gaussians.validate`.
+        InputError: see `Gaussians.validate`; Gaussians on a device without float64.
     """
     gaussians.validate("merge_to_limit's gaussians")
     cells = pixels * footprints(gaussians.means, cameras)
@@ -73,8 +74,8 @@ def _cell_ids(
     means: Float[Tensor, "N 3"], cells: Float[Tensor, "N"]
 ) -> tuple[Int[Tensor, "N"], int]:
     """Return the id of each mean's cell, from 0, and the number of cells."""
-    level = cells.double().log2().round()
-    offsets = means.double() - means.double().amin(0)
+    level, means = to_float64(cells).log2().round(), to_float64(means)
+    offsets = means - means.amin(0)
     position = (offsets / (2**level)[:, None]).floor()
     ids, count = _ranks(level)
     for axis in position.unbind(-1):

@@ -53,7 +53,8 @@ class Refinement:
         seed: seed of the order of views and of new Gaussians.
 
     Raises:
-        InputError: no Gaussians, invalid values, or views on another device.
+        InputError: no Gaussians, invalid values, views on another device, or a kind of
+            densification that needs float64 on a device without it.
     """
 
     def __init__(

@@ -29,6 +29,7 @@ from asysplat.runs.checkpoints import (
     load_weights,
     read_metadata,
 )
+from asysplat.runs.device import find_accelerator
 from asysplat.runs.revision import revision
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.run_folder import locked
@@ -98,8 +99,13 @@ class TrainingStage:
         cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
-        """Return the trainer's arguments that conf/trainer does not have."""
+        """Return the trainer's arguments that conf/trainer does not have, and its accelerator.
+
+        Raises:
+            InputError: Apple's GPU.
+        """
         return {
+            "accelerator": find_accelerator(self.config.trainer.accelerator),
             "callbacks": [*callbacks.values(), StageRecord(self.config.stage, self.earlier)],
             "logger": logger or False,
             # Otherwise Lightning adds its own callbacks.
@@ -175,14 +181,15 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
     """Check a configuration, lock the run's folder and find the stages that are to be trained.
 
     Raises:
-        InputError: an option is missing or out of range, another process trains in the folder, or a
-            checkpoint cannot be used.
+        InputError: an option is missing or out of range, the accelerator is Apple's GPU, another
+            process trains in the folder, or a checkpoint cannot be used.
     """
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     without_missing_network(config)
     configs = stage_configs(config)
     check_stages(configs)
+    find_accelerator(config.trainer.accelerator)  # refuses Apple's GPU before any work starts
     folder = Path(config.paths.run)
     with locked(folder):
         quiet_lightning()

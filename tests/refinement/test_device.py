@@ -55,6 +55,6 @@ def test_inputs_on_two_devices_are_refused(scene, monkeypatch):
     gaussians, views = scene
     with (
         pretended_device(monkeypatch) as device,
-        pytest.raises(InputError, match=r"^refine's views is on cpu and gaussians on mps"),
+        pytest.raises(InputError, match=r"^refine's views is on cpu and gaussians on ipu"),
     ):
         refine(gaussians.to(device), views, steps=1)

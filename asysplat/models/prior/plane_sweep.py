@@ -110,7 +110,7 @@ def plane_sweep(
         masks: False in pixels that have no confidence; None: in none.
 
     Raises:
-        InputError: sizes that do not fit together, or an unknown backend.
+        InputError: sizes that do not fit together, an unknown backend, or a device without float64.
     """
     _check(images, cameras, planes, neighbors)
     backend = choose_backend(backend, images)

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from asysplat.kernels.precision import to_float64
 from asysplat.scene import Cameras
 
 SAMPLES = 6  # points along each side of a view that stand for all its pixels
@@ -32,10 +33,14 @@ class PairwiseProjections:
 
     @classmethod
     def from_cameras(cls, cameras: Cameras) -> "PairwiseProjections":
-        """Compute the projections in float64."""
-        poses = cameras.cam_to_world.to(torch.float64)
+        """Compute the projections in float64.
+
+        Raises:
+            InputError: cameras on a device without float64.
+        """
+        poses = to_float64(cameras.cam_to_world)
         size = poses.new_tensor([1 / cameras.width, 1 / cameras.height, 1])
-        intrinsics = size[:, None] * cameras.intrinsics.to(torch.float64)
+        intrinsics = size[:, None] * to_float64(cameras.intrinsics)
         relative = torch.linalg.inv(poses)[:, None] @ poses[:, :, None]
         rays = relative[..., :3, :3] @ torch.linalg.inv(intrinsics)[:, :, None]
         to_other = torch.cat((rays, relative[..., :3, 3:]), dim=-1)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
+from asysplat.kernels.precision import to_float64
 from asysplat.refinement.densification.densifier import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
@@ -92,8 +93,11 @@ def split_opacity_and_scale(
 
     The paper's double sum of binomials is sum_k C(n, k) (-1)^(k+1) o^k / sqrt(k), k = 1 to n. More
     copies than MAX_COPIES count as that many; `counts` are >= 1.
+
+    Raises:
+        InputError: tensors on a device without float64.
     """
-    counts, before = counts.clamp(max=MAX_COPIES), opacities.double().clamp(max=1 - 1e-6)
+    counts, before = counts.clamp(max=MAX_COPIES), to_float64(opacities).clamp(max=1 - 1e-6)
     reduced = 1 - (1 - before) ** (1 / counts)
     term, total = -torch.ones_like(reduced), torch.zeros_like(reduced)
     for k in range(1, int(counts.max()) + 1):
