@@ -74,19 +74,18 @@ def find_fault(check: str, device: torch.device) -> str:
 
 
 def relative_errors(results: KernelResults, exact: KernelResults) -> dict[str, float]:
-    """Return the largest relative L2 errors of "outputs" and, where there are any, "gradients".
+    """Return the largest relative errors of "outputs" and, where there are any, "gradients"."""
+    pairs = zip(KernelResults._fields, results, exact, strict=True)
+    return {name: relative_error(tensors, true) for name, tensors, true in pairs if tensors}
 
-    An error is NaN where a result has NaN.
-    """
-    errors = {}
-    for name, tensors, true in zip(KernelResults._fields, results, exact, strict=True):
-        norms = [
-            (a.double() - b.double()).norm() / b.double().norm().clamp_min(1e-30)
-            for a, b in zip(tensors, true, strict=True)
-        ]
-        if norms:
-            errors[name] = torch.stack(norms).max().item()
-    return errors
+
+def relative_error(tensors: Sequence[Tensor], exact: Sequence[Tensor]) -> float:
+    """Return the largest of the relative L2 errors of tensors; NaN where one has NaN."""
+    errors = [
+        (a.double() - b.double()).norm() / b.double().norm().clamp_min(1e-30)
+        for a, b in zip(tensors, exact, strict=True)
+    ]
+    return torch.stack(errors).max().item()
 
 
 def describe_errors(errors: Mapping[str, float]) -> str:

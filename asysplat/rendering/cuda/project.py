@@ -25,6 +25,7 @@ MAX_MAGNITUDE = tl.constexpr(interface.MAX_MAGNITUDE)
 WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
 EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
+WIDENED = tl.constexpr(1 + 3e-6)  # what float32 rounds off of an extent
 COUNTERS = (
     2  # Gaussians that were culled by their opacity; those that were culled_by_frustum the image
 )
@@ -87,8 +88,9 @@ def project(
     room = EXPONENT_MARGIN - log_alpha_min
     if CULL_EXTENT:
         room += log_opacity
-    deviations = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
-    extent_x, extent_y = deviations * tl.sqrt(xx + eps2d), deviations * tl.sqrt(yy + eps2d)
+    deviations = tl.sqrt(tl.maximum(room, 0.0)) * (WIDENED / WHITEN_TO_LOG2)
+    extent_x = deviations * tl.sqrt((xx + eps2d).to(tl.float32))
+    extent_y = deviations * tl.sqrt((yy + eps2d).to(tl.float32))
     # Comparisons with NaN are false.
     visible = visible & (z > near) & (z < MAX_MAGNITUDE) & (opacity >= alpha_min) & (a > 0)
     visible = visible & (tl.abs(x + y + b + c) < float("inf"))
@@ -103,7 +105,7 @@ def project(
     if tl.max(visible.to(tl.int32), 0) > 0:
         color, visible = compute_colors(sh, g, offset, visible, COUNT)
         a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
-        ellipse = (x, y, a, b, c, extent_y * (1 + 1e-6))
+        ellipse = (x, y, a, b, c, extent_y)
         store_splat(splats, d, ellipse, log_opacity, color, z, visible)
     tl.store(depths + d, tl.where(visible, z, 0.0).to(tl.float32), mask=n < num)
     counter = counters + 2 * (image * tl.num_programs(0) + tl.program_id(0))

@@ -81,20 +81,18 @@ def store_splat(splats, d, ellipse, log_opacity, color, z, valid):
 
 @kernel
 def load_ellipse(splats, d, valid):
-    """Read center, a, b, c and extent along y of splats d, in float64; ones where not `valid`."""
+    """Read splats d: center, as whole pixels and rests, a, b, c, extent; ones where not `valid`."""
     splat = splats + SPLAT * d
     base = splat.to(tl.pointer_type(tl.int32))
-    x = tl.load(base, mask=valid, other=0).to(tl.float64)
-    y = tl.load(base + 1, mask=valid, other=0).to(tl.float64)
-    x += tl.load(splat + 2, mask=valid, other=1.0).to(tl.float64)
-    y += tl.load(splat + 3, mask=valid, other=1.0).to(tl.float64)
-    a = tl.load(splat + 4, mask=valid, other=1.0).to(tl.float64)
-    b = tl.load(splat + 5, mask=valid, other=1.0).to(tl.float64)
-    c = tl.load(splat + 6, mask=valid, other=1.0).to(tl.float64)
-    a += tl.load(splat + 7, mask=valid, other=0.0).to(tl.float64)
-    b += tl.load(splat + 8, mask=valid, other=0.0).to(tl.float64)
-    extent_y = tl.load(splat + 10, mask=valid, other=1.0).to(tl.float64)
-    return x, y, a, b, c, extent_y
+    base_x = tl.load(base, mask=valid, other=1)
+    base_y = tl.load(base + 1, mask=valid, other=1)
+    x = tl.load(splat + 2, mask=valid, other=1.0)
+    y = tl.load(splat + 3, mask=valid, other=1.0)
+    a = tl.load(splat + 4, mask=valid, other=1.0)
+    b = tl.load(splat + 5, mask=valid, other=1.0)
+    c = tl.load(splat + 6, mask=valid, other=1.0)
+    extent_y = tl.load(splat + 10, mask=valid, other=1.0)
+    return base_x, x, base_y, y, a, b, c, extent_y
 
 
 @kernel

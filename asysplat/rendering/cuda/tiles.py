@@ -11,9 +11,13 @@ from torch import Tensor
 
 from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas
+from asysplat.rendering.cuda.math import clamp
 from asysplat.rendering.cuda.splat import TILE, load_ellipse
 
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
+ROUNDING = tl.constexpr(1e-6)  # of float32, relative; an ellipse is widened by it
+MAX_TILT = tl.constexpr(1e15)
+MAX_OFFSET = tl.constexpr(2.0**30 - 128)  # pixels: twice as many fit int32
 
 
 class TileLists(NamedTuple):
@@ -91,30 +95,33 @@ def list_tiles(
 
 
 @kernel
-def tile_range(center, start, stop, size):
-    """See `cpu.tiles.tile_range`."""
-    first, last = center + start - 0.5 - PIXEL_MARGIN, center + stop - 0.5 + PIXEL_MARGIN
-    # Clamp the float: a number beyond int32 has no int.
-    first = tl.where(first > 0, tl.minimum(first, size * 1.0), 0.0)
-    last = tl.where(last < size - 1, tl.maximum(last, -1.0), size - 1.0)
-    first, last = tl.ceil(first).to(tl.int32), tl.floor(last).to(tl.int32)
+def tile_range(base, start, stop, margin, size):
+    """Compute the first and the last tile that has a pixel center in base + [start, stop].
+
+    `margin` widens the range by what rounding can move it; see `cpu.tiles.tile_range`.
+    """
+    first = tl.ceil(tl.maximum(start - 0.5 - margin, -MAX_OFFSET))
+    last = tl.floor(tl.minimum(stop - 0.5 + margin, MAX_OFFSET))
+    # A range to the image's edge, where the number is NaN too.
+    first = tl.where(first > -MAX_OFFSET, tl.minimum(first, MAX_OFFSET).to(tl.int32) + base, 0)
+    last = tl.where(last < MAX_OFFSET, tl.maximum(last, -MAX_OFFSET).to(tl.int32) + base, size)
+    first, last = tl.minimum(tl.maximum(first, 0), size), tl.minimum(tl.maximum(last, -1), size - 1)
     return first // TILE, tl.where(first <= last, last // TILE, first // TILE - 1)
 
 
 @kernel
 def tile_rows(ellipse, height):
     """Compute the first and the last row of tiles that the ellipse touches."""
-    _, y, _, _, _, extent = ellipse
-    return tile_range(y, -extent, extent, height)
+    _, _, base, y, _, _, _, extent = ellipse
+    return tile_range(base, y - extent, y + extent, PIXEL_MARGIN + ROUNDING * extent, height)
 
 
 @kernel
 def box_columns(ellipse, width):
     """Compute the first and the last tile of a row of tiles that the ellipse's box touches."""
-    x, _, a, b, c, extent = ellipse
-    tilt = b / c
-    half_width = c * extent * tl.sqrt(1 + tilt * tilt) / a
-    return tile_range(x, -half_width, half_width, width)
+    base, x, _, _, a, b, c, extent = ellipse
+    half = tl.sqrt(b * b + c * c) * extent / a
+    return tile_range(base, x - half, x + half, PIXEL_MARGIN + ROUNDING * half, width)
 
 
 @kernel
@@ -122,16 +129,24 @@ def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
     """See `cpu.tiles.row_span`; without CULL_ELLIPSE the tiles of the ellipse's box."""
     if not CULL_ELLIPSE:
         return box_columns(ellipse, width)
-    x, y, a, b, c, extent = ellipse
-    inverse_a, square = 1 / a, (c * extent) * (c * extent)
-    tilt = b / c
+    base_x, x, base_y, y, a, b, c, extent = ellipse
+    tilt = clamp(b / c, -MAX_TILT, MAX_TILT)
     tip = -tilt / tl.sqrt(tilt * tilt + 1) * extent  # dy of the rightmost point
-    low = (row * TILE).to(tl.float64) + (0.5 - PIXEL_MARGIN) - y
-    high = tl.minimum((row + 1) * TILE, height).to(tl.float64) - (0.5 - PIXEL_MARGIN) - y
+    margin = PIXEL_MARGIN + ROUNDING * extent
+    low = (row * TILE - base_y).to(tl.float32) + (0.5 - margin - y)
+    high = (tl.minimum((row + 1) * TILE, height) - base_y).to(tl.float32) - (0.5 - margin + y)
     low, high = tl.maximum(low, -extent), tl.minimum(high, extent)
     right_dy = tl.minimum(tl.maximum(tip, low), high)
     left_dy = tl.minimum(tl.maximum(-tip, low), high)
-    right_v, left_v = c * right_dy, c * left_dy
-    right = (tl.sqrt(tl.maximum(square - right_v * right_v, 0.0)) - b * right_dy) * inverse_a
-    left = (-tl.sqrt(tl.maximum(square - left_v * left_v, 0.0)) - b * left_dy) * inverse_a
-    return tile_range(x, left, right, width)
+    slope, flatness = b / a, c / a
+    right_half = flatness * half_chord(extent, right_dy)
+    left_half = flatness * half_chord(extent, left_dy)
+    right, left = right_half - slope * right_dy, -left_half - slope * left_dy
+    margin = tl.maximum(right_half, left_half) + tl.abs(slope) * extent
+    return tile_range(base_x, x + left, x + right, PIXEL_MARGIN + ROUNDING * margin, width)
+
+
+@kernel
+def half_chord(radius, height):
+    """Compute half of a circle's chord at a height."""
+    return tl.sqrt(tl.maximum((radius - height) * (radius + height), 0.0))
