@@ -63,7 +63,7 @@ def value_at(row: Result, path: str) -> Any:
     return row
 
 
-def largest_at(row: Result, path: str) -> float:
+def largest_at(row: Result, path: str) -> float | int:
     """Return the number at a path, or the largest of a dictionary of numbers."""
     value = value_at(row, path)
     return max(value.values()) if isinstance(value, Mapping) else value

@@ -27,8 +27,8 @@ NOT_MEASURED = "not measured"
 
 def tables() -> dict[str, str]:
     """Make every table of the page, by name."""
-    names = ("model", "growth/model", "render", "scaling")
-    model, growth, render, scaling = (
+    names = ("model", "growth/model", "render", "scaling", "machine_code")
+    model, growth, render, scaling, machine_code = (
         json.loads((RESULTS / f"{name}.json").read_text()) for name in names
     )
     growth, network = growth["rows"], scaling["network"]
@@ -96,6 +96,14 @@ def tables() -> dict[str, str]:
         terabytes = each * SCENES * PHOTOGRAPHS / 1e12
         return name, f"{each / 1e3:.0f}", f"{terabytes:.2f}", f"{100 * terabytes:.0f}"
 
+    def kernels_row(kernel: str) -> tuple:
+        rows = {row["card"]: row for row in estimates if row["kernel"] == kernel}
+        return kernel, *(f"{1e3 * row['seconds']:.2f} {row['bound']}" for row in rows.values())
+
+    estimates = machine_code["estimates"]
+    cards = list(dict.fromkeys(row["card"] for row in estimates))
+    kernels = list(dict.fromkeys(row["kernel"] for row in estimates))
+    sums = [sum(row["seconds"] for row in estimates if row["card"] == card) for card in cards]
     total = sum(flops[h, w] * batch * steps for h, w, batch, steps in STAGES.values())
     forms = {
         "JPEG for 540x960 (bytes a pixel as above)": jpeg_bytes,
@@ -134,6 +142,10 @@ def tables() -> dict[str, str]:
             "GPUs | scenes each | ms a step, at least | GB sent by each | GB/s "
             "| thousand photographs/s | cores for each GPU | GB/s of JPEG",
             map(gpus_row, GPUS),
+        ),
+        "kernels": markdown(
+            " | ".join(["estimated, ms", *cards]),
+            [*map(kernels_row, kernels), ("all", *(f"{1e3 * value:.1f}" for value in sums))],
         ),
         "photographs": markdown(
             "scene | files | kB each | bytes a pixel | 540x960 at that, kB "

@@ -31,6 +31,8 @@ KERNELS = {
     "adam": {"drop_not_finite", "update_rows"},
 }
 MAX_STACK = 256  # bytes of a thread: registers spilled to memory
+# Hopper's TF32 products; SSD is nearly twice as fast with them on an H200.
+LARGER_STACKS = {(90, "ssd.head_gradients"): 384, (90, "ssd.pass_states"): 272}
 
 
 @pytest.mark.medium
@@ -47,7 +49,8 @@ def test_every_launch_compiles_and_fits(capability):
     for launch in launches:
         usage = measure_usage(compile_launch(launch, capability), capability)
         name = f"{launch.name} of {launch.case}"
-        assert usage.stack <= MAX_STACK, (name, usage)
+        max_stack = LARGER_STACKS.get((capability, launch.name), MAX_STACK)
+        assert usage.stack <= max_stack, (name, usage)
         assert usage.shared + RESERVED_SHARED <= LIMITS[capability].shared, (name, usage)
         assert usage.occupancy > 0, (name, usage)
         if launch.kernel_name in ("rasterize", "rasterize_backward", "sum_pairs"):
