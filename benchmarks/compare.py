@@ -158,5 +158,5 @@ def _values(results: Result, tracked: TrackedMetrics) -> dict[tuple[str, str, st
                 values[name, sizes, path] = Value(value["median"], value["iqr"])
             elif value not in (None, {}):
                 noise = value_at(row, f"noise.{path}") or 0.0
-                values[name, sizes, path] = Value(largest_at(row, path), noise)
+                values[name, sizes, path] = Value(float(largest_at(row, path)), noise)
     return values
