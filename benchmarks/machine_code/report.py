@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # needs Triton
 TRACKED = TrackedMetrics(
     names=("capability", "kernel", "case"),
     must_match=(),
-    kinds={"instructions": Kind("instructions", "longer", "shorter", math.log(1.1))},
+    kinds={"instructions": Kind("instructions", "slower", "faster", math.log(1.1))},
 )
 SCENE = "4M"  # of benchmarks.scenes, whose rendering is estimated
 NOTES = """\
