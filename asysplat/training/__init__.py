@@ -1,6 +1,6 @@
 """Training: the LightningModule, its losses and its callbacks."""
 
-from asysplat.training.losses.disparity import InputDisparity, RenderedDisparity
+from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.module import SplattingModule
 from asysplat.training.prediction import Prediction
@@ -8,6 +8,7 @@ from asysplat.training.sharded import ShardedStrategy
 
 __all__ = [
     "InputDisparity",
+    "LogDepth",
     "Prediction",
     "RenderedDisparity",
     "ShardedStrategy",

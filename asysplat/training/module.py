@@ -17,6 +17,7 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.accumulated_metrics import AccumulatedMetrics
+from asysplat.training.joint_optimizer import JointOptimizer
 from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.parallel_scenes import Batch, ParallelScenes
 from asysplat.training.prediction import Prediction
@@ -30,6 +31,7 @@ class SplattingModule(lightning.LightningModule):
         net: views -> Gaussians; see `freeze_unused`.
         loss: compares a prediction with its batch.
         optimizer: parameter groups -> optimizer; only `decaying` parameters have weight decay.
+        matrix_optimizer: matrices -> optimizer, of `block_matrices`; None: as the others.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input
             views; in training black or white, whichever is less like that mean, so that
@@ -48,6 +50,7 @@ class SplattingModule(lightning.LightningModule):
         optimizer: Callable[[list[dict[str, Any]]], Optimizer],
         schedule: Callable[[Optimizer], LRScheduler],
         background: Sequence[float] | Literal["inputs"],
+        matrix_optimizer: Callable[[list[nn.Parameter]], Optimizer] | None = None,
         checkpoint_layers: bool = False,
         views_at_once: int | None = None,
         drop_above: float | None = None,
@@ -56,7 +59,8 @@ class SplattingModule(lightning.LightningModule):
         freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
-        self.optimizer, self.schedule = optimizer, schedule
+        self.optimizer, self.matrix_optimizer = optimizer, matrix_optimizer
+        self.schedule = schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
         self.timer = StepTimer()  # started and stopped by a callback
         self._parallel_scenes = ParallelScenes(net, self.scene_terms, self.timer)
@@ -133,10 +137,13 @@ class SplattingModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         decay = set(decaying(self.net))
-        trained = [p for p in self.parameters() if p.requires_grad]
+        matrices = block_matrices(self.net) if self.matrix_optimizer else []
+        trained = [p for p in self.parameters() if p.requires_grad and p not in set(matrices)]
         decayed = {"params": [p for p in trained if p in decay]}
         undecayed = {"params": [p for p in trained if p not in decay], "weight_decay": 0.0}
         optimizer = self.optimizer([decayed, undecayed])
+        if self.matrix_optimizer:
+            optimizer = JointOptimizer(optimizer, self.matrix_optimizer(matrices))
         schedule = {"scheduler": self.schedule(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
@@ -167,6 +174,13 @@ def decaying(net: nn.Module) -> list[nn.Parameter]:
     weights = [module.weight for module in net.modules() if isinstance(module, kinds)]
     tokens = getattr(net, "global_tokens", None)
     return weights if tokens is None else [*weights, tokens]
+
+
+def block_matrices(net: nn.Module) -> list[nn.Parameter]:
+    """List the trained weight matrices of the blocks, which lie between tokenizer and head."""
+    blocks = [module for module in net.modules() if isinstance(module, Layers)]
+    linear = [m for block in blocks for m in block.modules() if isinstance(m, nn.Linear)]
+    return [module.weight for module in linear if module.weight.requires_grad]
 
 
 def freeze_unused(net: Network) -> None:

@@ -1,5 +1,6 @@
 """Each term of the loss against its formula; terms without data are off."""
 
+import math
 import warnings
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.runs.runs import config_hash
 from asysplat.scene import Cameras, Gaussians, Views
-from asysplat.training import InputDisparity, Prediction, RenderedDisparity, SplattingLoss
+from asysplat.training import InputDisparity, LogDepth, Prediction, RenderedDisparity, SplattingLoss
 from asysplat.training.losses.disparity import (
     disparity_distance,
     normalized_disparity,
@@ -67,6 +68,17 @@ def test_normalized_disparity_by_hand():
     # Disparities 1, 2, 4: median 2, mean absolute deviation (1 + 0 + 2) / 3.
     expected = torch.tensor([[[-1.0, 0.0], [2.0, 0.0]]])
     torch.testing.assert_close(normalized_disparity(disparity, valid), expected)
+
+
+def test_nearly_constant_depths_have_no_greater_gradients_than_others():
+    """Those of an untrained network."""
+    target = 0.5 + torch.rand(2, 16, 16)
+    norms = []
+    for spread in (1e-3, 0.5):
+        depth = (2 + spread * torch.rand(2, 16, 16)).requires_grad_()
+        disparity_distance(depth, target, torch.ones_like(target, dtype=torch.bool)).backward()
+        norms.append(depth.grad.norm())
+    assert norms[0] < 2 * norms[1]
 
 
 def test_disparities_come_before_depths():
@@ -177,6 +189,25 @@ def test_gaussians_that_are_no_map_of_the_views():
     prediction = Prediction(gaussians_at(torch.ones(9, 3)), pair()[0].rendering)
     with pytest.raises(InputError, match=r"gave 9 for 2 views of 4x4.*training/depth=rendered"):
         InputDisparity()(prediction, {"inputs": inputs})
+
+
+def test_log_depth_sees_the_scale_and_ignores_unknown_depths():
+    depth = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])
+    known = torch.tensor([[[1.0, 4.0], [0.0, 1.0]]])
+    inputs = Views(cameras(2, views=1), torch.rand(1, 3, 2, 2), known)
+    means = torch.stack((torch.zeros_like(depth), torch.zeros_like(depth), depth), -1)
+    scale = torch.ones((), requires_grad=True)
+    gaussians = gaussians_at(scale * means.flatten(0, 2))
+    prediction, term = Prediction(gaussians, one_view()), LogDepth()
+    distance = term(prediction, {"inputs": inputs})
+    torch.testing.assert_close(distance.item(), (math.log(2) + math.log(4)) / 3)
+    # Of three known depths one is right, one too small and one too large.
+    distance.backward()
+    assert scale.grad.abs() <= 1 / 3 + 1e-6
+    no_depths = Views(inputs.cameras, inputs.images)
+    assert term(prediction, {"inputs": no_depths}) is None
+    masked = replace(inputs, masks=torch.tensor([[[True, False], [True, False]]]))
+    assert term(prediction, {"inputs": masked}) == 0
 
 
 @pytest.mark.parametrize("rows", [8, 32])

@@ -18,6 +18,7 @@ from asysplat.scene import Gaussians, Views, inverse_depths
 from asysplat.training.prediction import Prediction
 
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
+MIN_DEVIATION = 0.1  # of the median disparity
 MIN_DEPTH = 1e-2  # depths are clamped to it, as in Long-LRM
 
 
@@ -66,6 +67,29 @@ class InputDisparity:
         if inputs.masks is not None:
             valid = valid & inputs.masks[..., ::stride, ::stride]
         return disparity_distance(depth.clamp_min(MIN_DEPTH), target, valid)
+
+
+class LogDepth:
+    """Compares the logarithms of Gaussians' depths in their own input views with the views' depths.
+
+    Ours: it sees the scale of a scene, which normalized disparities do not.
+    """
+
+    renders_depth = False
+
+    def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
+        """Compute the mean over scenes of the mean absolute difference; None without depths."""
+        inputs = batch["inputs"]
+        if inputs.depths is None:
+            return None
+        depth = own_depths(prediction.gaussians, inputs).clamp_min(MIN_DEPTH)
+        stride = inputs.cameras.height // depth.shape[-2]
+        target = inputs.depths[..., ::stride, ::stride]
+        valid = target > 0
+        if inputs.masks is not None:
+            valid = valid & inputs.masks[..., ::stride, ::stride]
+        error = (depth.log() - torch.where(valid, target, 1).log()).abs() * valid
+        return (error.sum((-3, -2, -1)) / valid.sum((-3, -2, -1)).clamp_min(1)).mean()
 
 
 def reference_disparities(views: Views) -> Float[Tensor, "*batch V H W"] | None:
@@ -122,10 +146,15 @@ def disparity_distance(
 def normalized_disparity(
     disparity: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
 ) -> Float[Tensor, "V H W"]:
-    """Compute (disparity - median) / mean absolute deviation of each view; invalid pixels are 0."""
+    """Compute (disparity - median) / mean absolute deviation of each view; invalid pixels are 0.
+
+    The deviation is at least MIN_DEVIATION of the median: the depths of an untrained network are
+    nearly the same, and a division by almost nothing would make their gradients the largest of all.
+    """
     values = torch.where(valid, disparity, torch.nan).flatten(1)
     median = values.nanmedian(dim=1, keepdim=True).values
     centered = torch.where(valid.flatten(1), values - median.nan_to_num(), 0)
     count = valid.flatten(1).sum(1, keepdim=True).clamp_min(1)
     deviation = centered.abs().sum(1, keepdim=True) / count
-    return (centered / deviation.clamp_min(1e-6)).view_as(disparity)
+    floor = (MIN_DEVIATION * median.nan_to_num().abs()).clamp_min(1e-6)
+    return (centered / deviation.maximum(floor)).view_as(disparity)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import ssim
-from asysplat.training.losses.disparity import InputDisparity, RenderedDisparity
+from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.perceptual import PerceptualDistance, vgg16
 from asysplat.training.prediction import Prediction
 
@@ -40,7 +40,7 @@ class SplattingLoss(nn.Module):
         ssim: float = 0.0,
         opacity: float = 0.0,
         perceptual_term: Callable[[], PerceptualDistance] = vgg16,
-        depth_term: Callable[[], RenderedDisparity | InputDisparity] = RenderedDisparity,
+        depth_term: Callable[[], RenderedDisparity | InputDisparity | LogDepth] = RenderedDisparity,
         allow_missing: bool = True,
     ):
         super().__init__()
