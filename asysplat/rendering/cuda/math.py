@@ -1,6 +1,6 @@
 """Arithmetic of the renderer's kernels: cameras, ellipses, spherical harmonics (SH).
 
-Both projection passes share it: SH in float32, the rest in float64.
+Both projection passes share it: directions and SH in float32, the rest in the type of its inputs.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Project Gaussians to splats in float64, whatever the inputs' type; a splat is rounded once."""
+"""Project Gaussians to splats, in float64 where numbers cancel, whatever the type of the inputs."""
 
 import triton.language as tl
 
@@ -26,9 +26,7 @@ WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
 EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
 WIDENED = tl.constexpr(1 + 3e-6)  # what float32 rounds off of an extent
-COUNTERS = (
-    2  # Gaussians that were culled by their opacity; those that were culled_by_frustum the image
-)
+COUNTERS = 2  # Gaussians culled by their opacity, and by the frustum
 
 
 @kernel
