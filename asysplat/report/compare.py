@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import spearmanr
+from scipy.stats import t as student
 
 from asysplat.report.paper import Claim, Costs, Number, PaperRow, PaperTable
 
@@ -30,6 +31,29 @@ class RankAgreement(NamedTuple):
 def mean_and_std(values: Sequence[Number]) -> tuple[float, float | None]:
     """Return mean and sample standard deviation over seeds; None for that of a single seed."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def paired_difference(
+    row: PaperRow, base: PaperRow, column: str
+) -> tuple[float, float | None] | None:
+    """Compare two rows in the seeds that both have: mean difference, and half of its interval.
+
+    The interval holds the true mean difference with 95 % confidence, by Student's t; None for one
+    seed. Seeds share scenes and their order, so that their differences vary less than each row.
+
+    Returns:
+        None where no seed has both numbers.
+    """
+    sides = [dict(zip(r.seeds, r.values.get(column, ()), strict=False)) for r in (row, base)]
+    differences = [
+        sides[0][seed] - sides[1][seed] for seed in sorted(set.intersection(*map(set, sides)))
+    ]
+    if not differences:
+        return None
+    mean, std = mean_and_std(differences)
+    count = len(differences)
+    half = None if std is None else std / math.sqrt(count) * float(student.ppf(0.975, count - 1))
+    return mean, half
 
 
 def rank_agreement(filled: PaperTable, column: str) -> RankAgreement:

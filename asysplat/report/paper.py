@@ -106,6 +106,7 @@ class PaperTable:
     columns: tuple[Column, ...]
     rows: tuple[PaperRow, ...] = field(repr=False)  # in the paper's order
     rank_by: str | None = None  # key of the column whose order is compared with the paper's
+    base: str | None = None  # name of the row that the others of an ablation differ from
     claims: tuple[Claim, ...] = field(default=(), repr=False)  # in place of columns and rows
 
     # Our numbers
@@ -155,7 +156,7 @@ def load_claims() -> PaperTable:
         text, column = claim.get("text") or claim["ours"], _column(claim["column"])
         claims.append(Claim(text, "text" in claim, claim["form"], claim["table"], column, sides))
     return PaperTable(
-        "claims", None, entry["title"], entry["protocol"], (), (), None, tuple(claims)
+        "claims", None, entry["title"], entry["protocol"], (), (), claims=tuple(claims)
     )
 
 
@@ -222,8 +223,9 @@ def _table(key: str, entry: dict) -> PaperTable:
     columns = map(_column, (*entry["columns"], *entry.get("computed", ())))
     rows = tuple(_row(row, entry) for row in entry["rows"])
     number = None if entry["number"] is None else str(entry["number"])
-    title, protocol, rank_by = entry["title"], entry["protocol"], entry.get("rank_by")
-    return PaperTable(key, number, title, protocol, tuple(columns), rows, rank_by)
+    title, protocol = entry["title"], entry["protocol"]
+    order = {"rank_by": entry.get("rank_by"), "base": entry.get("base")}
+    return PaperTable(key, number, title, protocol, tuple(columns), rows, **order)
 
 
 def _row(row: dict, table: dict) -> PaperRow:

@@ -123,6 +123,9 @@ def test_rows_of_a_table_have_their_own_names_and_runs():
         tested = {(row.run, row.size, row.post_optimization, row.test_set) for row in ours}
         assert len(tested) == len(ours)
         assert table.rank_by is None or all(table.rank_by in row.numbers for row in table.rows)
+        assert table.base in (None, *(row.name for row in ours))
+    bases = {table.key: table.base for table in load_paper().values() if table.base}
+    assert bases.keys() >= {"architecture", "layers", "asymmetry", "geometry_ratio"}
 
 
 def test_methods_that_are_only_quoted():

@@ -4,16 +4,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asysplat.report.cells import make_section
 from asysplat.report.compare import (
     check_costs,
     claim_value,
     cost_errors,
     fits,
+    paired_difference,
     pooled_std,
     rank_agreement,
     spearman,
 )
 from asysplat.report.paper import Claim, Column, PaperRow, PaperTable
+from asysplat.report.table import Cell
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
 
@@ -55,6 +58,40 @@ def test_rank_agreement_of_one_seed_has_no_signal():
     assert rank_agreement(table, "dl3dv/psnr").rho == pytest.approx(-1.0)
     assert rank_agreement(table, "dl3dv/psnr").signal is None
     assert rank_agreement(filled([1.0], [[]]), "dl3dv/psnr").rows == 0
+
+
+def seeded(name: str, seeds: tuple[int, ...], psnr: list[float]) -> PaperRow:
+    return replace(row(name, psnr=20.0), seeds=seeds, values={"dl3dv/psnr": psnr})
+
+
+def test_differences_are_paired_by_seed():
+    base = seeded("base", (0, 1, 2, 5), [20.0, 25.0, 15.0, 99.0])
+    better = seeded("better", (0, 1, 2), [20.4, 25.5, 15.6])
+    mean, half = paired_difference(better, base, "dl3dv/psnr")
+    # Rows spread by 5 dB and their differences by 0.1: t of two degrees of freedom is 4.303.
+    assert mean == pytest.approx(0.5) and half == pytest.approx(
+        4.303 * 0.1 / math.sqrt(3), rel=1e-3
+    )
+    assert paired_difference(seeded("one", (1,), [24.0]), base, "dl3dv/psnr") == (-1.0, None)
+    assert paired_difference(seeded("other", (7,), [24.0]), base, "dl3dv/psnr") is None
+    assert paired_difference(better, base, "dl3dv/ssim") is None
+
+
+def test_a_table_shows_which_rows_differ_more_than_seeds():
+    rows = (
+        seeded("base", (0, 1, 2), [20.0, 25.0, 15.0]),
+        seeded("clear", (0, 1, 2), [20.4, 25.5, 15.6]),
+        seeded("unclear", (0, 1, 2), [20.6, 24.5, 15.1]),
+        seeded("one seed", (1,), [24.0]),
+    )
+    table = PaperTable("t", "1", "title", "protocol", (PSNR,), rows, base="base")
+    grid = make_section(table).grids[1]
+    assert grid.caption.startswith("Differences to base, paired by seed")
+    cells = {name.text: cell for name, cell in grid.rows}
+    assert cells["clear"] == Cell("+0.50 ± 0.25", "best")
+    assert cells["unclear"] == Cell("+0.07 ± 1.37", "")
+    assert cells["one seed"] == Cell("-1.00", "muted")
+    assert len(make_section(replace(table, base=None)).grids) == 1
 
 
 def test_cost_errors_are_relative_to_the_paper():
