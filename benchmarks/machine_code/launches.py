@@ -136,7 +136,7 @@ def _adam() -> None:
 
 CASES: dict[str, Callable[[], None]] = {
     TRAINING: lambda: _render(0, 4, False),
-    "render, refinement": lambda: _render(1, 1, False, depth=None),
+    "render, refinement": lambda: _render(1, 1, False, depth=False),
     "render, all options": lambda: _render(*(3, 4, True, True), depth="median", antialiased=True),
     "plane sweep": lambda: _plane_sweep(48),
     "selective scan, fp32": lambda: _scan(selective_scan, (512,), 16, torch.float32),
