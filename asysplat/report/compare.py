@@ -44,7 +44,9 @@ def paired_difference(
     Returns:
         None where no seed has both numbers.
     """
-    sides = [dict(zip(r.seeds, r.values.get(column, ()), strict=False)) for r in (row, base)]
+    numbers = [(side.seeds, side.values.get(column, ())) for side in (row, base)]
+    # A list that lacks a seed does not tell which.
+    sides = [dict(zip(*n, strict=True)) if len(n[0]) == len(n[1]) else {} for n in numbers]
     differences = [
         sides[0][seed] - sides[1][seed] for seed in sorted(set.intersection(*map(set, sides)))
     ]

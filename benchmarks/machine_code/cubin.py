@@ -49,10 +49,10 @@ class Usage(NamedTuple):
     of loops, the others one loop each, from its first instruction to its branch back.
     """
 
-    registers: int  # of a thread
+    registers: int  # registers of a thread
     stack: int  # bytes of a thread, in memory: spilled registers
     shared: int  # bytes of a block
-    warps: int  # of a block
+    warps: int  # warps of a block
     occupancy: float  # warps that fit on a multiprocessor, as a fraction of its limit
     instructions: list[Counter[str]]
 
@@ -121,7 +121,7 @@ def count_instructions(sass: str) -> list[Counter[str]]:
                     loops.append((start, len(lines)))
             lines.append(name)
     merged: dict[int, int] = {}
-    for start, end in loops:  # of several ways back to one start, the last
+    for start, end in loops:  # a loop with several branches back ends at the last
         merged[start] = max(end, merged.get(start, 0))
     counts = [Counter() for _ in range(len(merged) + 1)]
     ordered = sorted(merged.items())

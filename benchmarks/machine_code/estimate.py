@@ -24,6 +24,7 @@ from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE
 from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import project
 from asysplat.rendering.reference.tiles import list_tiles
+from benchmarks.machine_code.cubin import Usage
 from benchmarks.scenes import Scene
 
 NUMBER = 4  # bytes of a float32
@@ -59,11 +60,11 @@ class RenderingWork(NamedTuple):
     programs: dict[str, int]
     rounds: dict[str, tuple[float, ...]]
     bytes: dict[str, float]
-    pairs: int  # of splat and tile
+    pairs: int  # pairs of splat and tile
 
 
 @torch.no_grad()
-def measure_workload(scene: Scene) -> RenderingWork:
+def measure_work(scene: Scene) -> RenderingWork:
     """Project a scene and list its tiles, by the reference, to count programs and rounds."""
     gaussians, cameras = (part.map(lambda tensor: tensor[None]) for part in scene)
     splats = project(gaussians, cameras, RenderSettings(depth=None))
@@ -108,6 +109,23 @@ def measure_workload(scene: Scene) -> RenderingWork:
         },
         pairs=pairs,
     )
+
+
+def estimate_launches(
+    card: Card, kernel: str, usages: Sequence[Usage], work: RenderingWork
+) -> tuple[float, str]:
+    """Return the seconds of a kernel's launches, each of which does all work, and the bound."""
+    parts = [
+        estimate(
+            card,
+            usage.instructions,
+            work.rounds[kernel],
+            work.programs[kernel] * usage.warps,
+            work.bytes[kernel],
+        )
+        for usage in usages
+    ]
+    return sum(seconds for seconds, _ in parts), parts[0][1]
 
 
 def estimate(

@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 from rich.console import Console
@@ -15,10 +14,6 @@ from benchmarks.compare import Kind, TrackedMetrics
 from benchmarks.scenes import SCENES
 from benchmarks.table import machine_text, make_table, number_column, text_column
 from benchmarks.timing import Result
-
-if TYPE_CHECKING:  # needs Triton
-    from benchmarks.machine_code.cubin import Usage
-    from benchmarks.machine_code.estimate import RenderingWork
 
 TRACKED = TrackedMetrics(
     names=("capability", "kernel", "case"),
@@ -48,7 +43,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     if not find_spec("triton"):
         raise InputError("suite=machine_code needs Triton, which comes with torch on Linux.")
     from benchmarks.machine_code.cubin import LIMITS, compile_launch, measure_usage, without_repeats
-    from benchmarks.machine_code.estimate import CARDS, measure_workload
+    from benchmarks.machine_code.estimate import CARDS, estimate_launches, measure_work
     from benchmarks.machine_code.launches import TRAINING, record_launches
 
     capabilities = list(options.machine_code.capabilities)
@@ -68,36 +63,15 @@ def measure(options: DictConfig, console: Console) -> Result:
             if launch.case == TRAINING:
                 training.setdefault((capability, launch.kernel_name), []).append(usage)
     scene = SCENES[SCENE]()
-    workload = measure_workload(scene)
-    estimates = [
-        _estimate_kernel(name, kernel, training[card.capability, kernel], workload)
-        for name, card in CARDS.items()
-        if card.capability in capabilities
-        for kernel in workload.programs
-    ]
+    work, estimates = measure_work(scene), []
+    for name, card in CARDS.items():
+        for kernel in work.programs if card.capability in capabilities else ():
+            usages = training[card.capability, kernel]
+            seconds, bound = estimate_launches(card, kernel, usages, work)
+            estimates.append({"card": name, "kernel": kernel, "seconds": seconds, "bound": bound})
     sizes = {"gaussians": scene[0].num_gaussians}
-    sizes |= {"height": scene[1].height, "width": scene[1].width, "pairs": workload.pairs}
+    sizes |= {"height": scene[1].height, "width": scene[1].width, "pairs": work.pairs}
     return {"rows": rows, "estimates": estimates, "scene": sizes}
-
-
-def _estimate_kernel(
-    card: str, kernel: str, usages: list["Usage"], workload: "RenderingWork"
-) -> dict[str, Any]:
-    """Add the estimates of a kernel's launches, each of which does the whole workload."""
-    from benchmarks.machine_code.estimate import CARDS, estimate
-
-    parts = [
-        estimate(
-            CARDS[card],
-            usage.instructions,
-            workload.rounds[kernel],
-            workload.programs[kernel] * usage.warps,
-            workload.bytes[kernel],
-        )
-        for usage in usages
-    ]
-    seconds, bounds = zip(*parts, strict=True)
-    return {"card": card, "kernel": kernel, "seconds": sum(seconds), "bound": bounds[0]}
 
 
 def tables(results: Result) -> list[Table]:

@@ -77,6 +77,6 @@ def test_a_render_in_a_cuda_graph_is_an_error(make_scene, monkeypatch):
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
     gaussians, cameras = make_scene(dtype=torch.float32)
-    gaussians.means.fill_(torch.nan)  # which is not looked at: that would wait
+    gaussians.means.fill_(torch.nan)  # validation would wait for the GPU
     with pytest.raises(InputError, match=r"waits for the GPU.* call it outside torch.cuda.graph.$"):
         render(gaussians, cameras, validate=True)

@@ -75,6 +75,8 @@ def test_differences_are_paired_by_seed():
     assert paired_difference(seeded("one", (1,), [24.0]), base, "dl3dv/psnr") == (-1.0, None)
     assert paired_difference(seeded("other", (7,), [24.0]), base, "dl3dv/psnr") is None
     assert paired_difference(better, base, "dl3dv/ssim") is None
+    # A list that is shorter than its seeds cannot be paired.
+    assert paired_difference(seeded("short", (0, 1, 2), [20.4, 25.5]), base, "dl3dv/psnr") is None
 
 
 def test_a_table_shows_which_rows_differ_more_than_seeds():

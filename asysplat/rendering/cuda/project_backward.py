@@ -140,9 +140,9 @@ def project_backward(
                 COUNT=COUNT,
             )
             g_opacity += tl.where(drawn, opacity_part, 0.0)
-            g_mean = add_where(g_mean, drawn, mean_part)
-            g_scale = add_where(g_scale, drawn, scale_part)
-            g_quat = add_where(g_quat, drawn, quat_part) + (
+            g_mean = plus(g_mean, 1.0, keep_where(drawn, mean_part))
+            g_scale = plus(g_scale, 1.0, keep_where(drawn, scale_part))
+            g_quat = plus(g_quat, 1.0, keep_where(drawn, quat_part)) + (
                 g_quat[3] + tl.where(drawn, quat_part[3], 0.0),
             )
     store3(grad_means, g, g_mean, valid)
@@ -181,16 +181,6 @@ def keep_where(condition, values):
         tl.where(condition, values[0], 0.0),
         tl.where(condition, values[1], 0.0),
         tl.where(condition, values[2], 0.0),
-    )
-
-
-@kernel
-def add_where(total, drawn, part):
-    """Add the three numbers of `part` where `drawn`."""
-    return (
-        total[0] + tl.where(drawn, part[0], 0.0),
-        total[1] + tl.where(drawn, part[1], 0.0),
-        total[2] + tl.where(drawn, part[2], 0.0),
     )
 
 
@@ -291,8 +281,7 @@ def splat_backward(
             g_value += g_green * tl.load(coefficients + 1, mask=drawn, other=0.0).to(tl.float32)
             g_value += g_blue * tl.load(coefficients + 2, mask=drawn, other=0.0).to(tl.float32)
             g_basis = g_basis + (g_value,)
-        g_dx, g_dy, g_dz = sh_basis_gradient(dx, dy, dz, g_basis, COUNT)
-        g_direction = (g_dx, g_dy, g_dz)
+        g_direction = sh_basis_gradient(dx, dy, dz, g_basis, COUNT)
         g_offset = plus(g_offset, 1 / length, g_direction)
         radial = dot(offset, g_direction) / (length * length * length)
         g_offset = plus(g_offset, tl.where(square > MIN_SQUARED_DISTANCE, -radial, 0.0), offset)
@@ -311,8 +300,8 @@ def splat_backward(
 
 @kernel
 def unclamped_gradient(color, grad):
-    """Return the color's gradient in float32, 0 where the color is clamped."""
-    return tl.where(color > 0, grad.to(tl.float32), 0.0)
+    """Return the color's gradient, 0 where the color is clamped."""
+    return tl.where(color > 0, grad, 0.0)
 
 
 @kernel

@@ -60,13 +60,7 @@ class InputDisparity:
         inputs, target = batch["inputs"], reference_disparities(batch["inputs"])
         if target is None:
             return None
-        depth = own_depths(prediction.gaussians, inputs)
-        stride = inputs.cameras.height // depth.shape[-2]
-        target = target[..., ::stride, ::stride]
-        valid = target > 0
-        if inputs.masks is not None:
-            valid = valid & inputs.masks[..., ::stride, ::stride]
-        return disparity_distance(depth.clamp_min(MIN_DEPTH), target, valid)
+        return disparity_distance(*depths_and_targets(prediction.gaussians, inputs, target))
 
 
 class LogDepth:
@@ -82,12 +76,7 @@ class LogDepth:
         inputs = batch["inputs"]
         if inputs.depths is None:
             return None
-        depth = own_depths(prediction.gaussians, inputs).clamp_min(MIN_DEPTH)
-        stride = inputs.cameras.height // depth.shape[-2]
-        target = inputs.depths[..., ::stride, ::stride]
-        valid = target > 0
-        if inputs.masks is not None:
-            valid = valid & inputs.masks[..., ::stride, ::stride]
+        depth, target, valid = depths_and_targets(prediction.gaussians, inputs, inputs.depths)
         error = (depth.log() - torch.where(valid, target, 1).log()).abs() * valid
         return (error.sum((-3, -2, -1)) / valid.sum((-3, -2, -1)).clamp_min(1)).mean()
 
@@ -124,6 +113,21 @@ def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h
     offsets = means - cameras.centers[..., None, None, :]
     # A matrix product would be rounded to half precision by autocast.
     return (offsets * cameras.cam_to_world[..., None, None, :3, 2]).sum(-1)
+
+
+def depths_and_targets(
+    gaussians: Gaussians, inputs: Views, target: Float[Tensor, "*batch V H W"]
+) -> tuple[
+    Float[Tensor, "*batch V h w"], Float[Tensor, "*batch V h w"], Bool[Tensor, "*batch V h w"]
+]:
+    """Compute `own_depths`, the target at their pixels, and where it is known and counts."""
+    depth = own_depths(gaussians, inputs).clamp_min(MIN_DEPTH)
+    stride = inputs.cameras.height // depth.shape[-2]
+    target = target[..., ::stride, ::stride]
+    valid = target > 0
+    if inputs.masks is not None:
+        valid = valid & inputs.masks[..., ::stride, ::stride]
+    return depth, target, valid
 
 
 def disparity_distance(

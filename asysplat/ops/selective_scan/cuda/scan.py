@@ -50,8 +50,9 @@ def backward(
     """Return the gradients of the inputs; see `asysplat.ops.scan`."""
     inputs = ScanInputs(*(tensor.contiguous() for tensor in inputs))
     grad_output = grad_output.contiguous()
-    grads = ScanInputs(*(torch.zeros_like(tensor) for tensor in inputs))
-    x, dt, A, B, C, _ = inputs
+    x, dt, A, B, C, D = inputs
+    grads = ScanInputs(*(torch.empty_like(tensor) for tensor in inputs))
+    grads = grads._replace(A=torch.zeros_like(A), D=torch.zeros_like(D))  # sums over segments
     segments, chunk = _segments(x, A), BACKWARD_CHUNK
     state, grad_state = _zero_state(x, A), _zero_state(x, A)
     with torch.cuda.device_of(x):
@@ -59,9 +60,8 @@ def backward(
         for segment in segments:
             first_states.append(state.clone())
             states = _compute_states(x, dt, A, B, state, segment, chunk, reverse)
-        for segment in reversed(segments):
+        for segment, state in reversed(list(zip(segments, first_states, strict=True))):
             if segment != segments[-1]:  # whose states are there
-                state = first_states[segments.index(segment)]
                 states = _compute_states(x, dt, A, B, state, segment, chunk, reverse)
             grad_states = _compute_states(
                 *(grad_output, dt, A, C, grad_state, segment, chunk, reverse), gradient=True
