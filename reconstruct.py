@@ -31,6 +31,7 @@ from asysplat.data.cameras import CameraOptions
 from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
+from asysplat.export.viewer import Viewer
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
@@ -72,7 +73,7 @@ def reconstruct(config: DictConfig) -> None:
     gaussians = initialize(config, photographs, settings)
     background = photographs.inputs.mean_color()
     results.save_start(gaussians, photographs, background)
-    with RefinementDisplay(photographs.inputs, config.view) as display:
+    with RefinementDisplay(Viewer(photographs.inputs) if config.view else None) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}
         gaussians = refine(gaussians, photographs.inputs, settings, **options)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):

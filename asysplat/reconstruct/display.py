@@ -10,7 +10,7 @@ from rich.console import Console
 
 from asysplat.export.viewer import Viewer
 from asysplat.refinement.refine import Refinement, RefinementProgress
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Gaussians
 
 VIEWER_SECONDS = 1.0  # between two updates of the viewer
 PRINT_SECONDS = 10.0  # between two lines where there is no terminal
@@ -18,20 +18,20 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class RefinementDisplay:
-    """Show a progress bar and, with `view`, a viewer; Ctrl-C ends the refinement after its step.
+    """Show a progress bar and, if given, a viewer; Ctrl-C ends the refinement after its step.
 
     As a context manager it handles SIGINT and SIGTERM until its end: the second Ctrl-C interrupts,
     while a scheduler or a closed terminal may send any number of signals.
     """
 
-    def __init__(self, views: Views, view: bool):
+    def __init__(self, viewer: Viewer | None = None):
         self.last: RefinementProgress | None = None
         self.stopped = False
         self._terminal = Console().is_terminal
         self._printed = self._shown = time.monotonic()
-        self._viewer = Viewer(views) if view else None
-        if self._viewer is not None:
-            print(f"viewer: {self._viewer.url}")
+        self._viewer = viewer
+        if viewer is not None:
+            print(f"viewer: {viewer.url}")
 
     def __enter__(self) -> "RefinementDisplay":
         self._handlers = {number: signal.signal(number, self._stop) for number in SIGNALS}
