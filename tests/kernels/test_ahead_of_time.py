@@ -4,12 +4,15 @@ The interpreter takes what the compiler may not, and knows no registers.
 """
 
 import ast
+import re
+from collections import Counter
 
 import pytest
 
 pytest.importorskip("triton")
 
 from benchmarks.machine_code.cubin import (
+    LANES,
     LIMITS,
     RESERVED_SHARED,
     compile_launch,
@@ -55,6 +58,33 @@ def test_every_launch_compiles_and_fits(capability):
         assert usage.occupancy > 0, (name, usage)
         if launch.kernel_name in ("rasterize", "rasterize_backward", "sum_pairs"):
             assert not any("float64" in counts for counts in usage.instructions), name
+
+
+@pytest.mark.parametrize("capability", [80, 90, 100])
+def test_a_splat_is_few_instructions_of_memory_none_waiting_for_a_store(capability):
+    launches = without_repeats(record_launches(capability), capability)
+    launches = [launch for launch in launches if launch.case.startswith("render")]
+    # Columns of 8 bytes but for red; the entry; backward, the pair and one store.
+    allowed = {"rasterize": 9, "rasterize_backward": 11}
+    hot = [launch for launch in launches if launch.kernel_name in allowed]
+    assert {launch.kernel_name for launch in hot} == allowed.keys()
+    for launch in hot:
+        compiled, step = compile_launch(launch, capability), launch.arguments["STEP"]
+        loop = max(measure_usage(compiled, capability).instructions[1:], key=Counter.total)
+        assert 0 < loop["memory"] <= allowed[launch.kernel_name] * step, (launch.case, loop)
+        if launch.kernel_name == "rasterize_backward":
+            accesses = re.findall(r"\b(ld|st)\.global", compiled.asm["ptx"])
+            first = accesses.index("st")
+            assert accesses[first : first + step] == ["st"] * step, launch.case
+
+
+def test_no_lane_repeats_the_work_of_another():
+    one_each = {"project", "list_tiles", "project_backward"}  # a lane for each number of a block
+    launches = [launch for launch in record_launches(90) if launch.kernel_name in one_each]
+    assert {launch.kernel_name for launch in launches} == one_each
+    for launch in launches:
+        lanes = launch.arguments.get("num_warps", 4) * LANES  # Triton's default is 4
+        assert lanes == launch.arguments["BLOCK"], launch.case
 
 
 SASS = """

@@ -122,6 +122,20 @@ def color_pixels(pixel, image, height, width):
 
 
 @kernel
+def load_two(splat, k, valid):
+    """Read columns k, which is even, and k + 1 of a splat, by one load; bits as int32, or 0."""
+    both = tl.load((splat + k).to(tl.pointer_type(tl.int64)), mask=valid, other=0)
+    return both.to(tl.int32), (both >> 32).to(tl.int32)
+
+
+@kernel
+def load_two_floats(splat, k, valid):
+    """Read float32 columns, see `load_two`."""
+    low, high = load_two(splat, k, valid)
+    return low.to(tl.float32, bitcast=True), high.to(tl.float32, bitcast=True)
+
+
+@kernel
 def load_splat(splats, d, left, top, valid):
     """Read splat d relative to the middle of the tile whose first pixel is (left, top).
 
@@ -130,18 +144,16 @@ def load_splat(splats, d, left, top, valid):
     center of a needle the two terms nearly cancel: products are exact, as sums of two numbers.
     """
     splat = splats + SPLAT * d
-    base = splat.to(tl.pointer_type(tl.int32))
-    pixels_x = left + HALF_TILE - tl.load(base, mask=valid, other=0)
-    pixels_y = top + HALF_TILE - tl.load(base + 1, mask=valid, other=0)
+    base_x, base_y = load_two(splat, 0, valid)
+    center_x, center_y = load_two_floats(splat, 2, valid)
+    a, b = load_two_floats(splat, 4, valid)
+    c, rest_a = load_two_floats(splat, 6, valid)
+    rest_b, log_opacity = load_two_floats(splat, 8, valid)
+    log_opacity = tl.where(valid, log_opacity, -64.0)
+    pixels_x, pixels_y = left + HALF_TILE - base_x, top + HALF_TILE - base_y
     x, y = pixels_x.to(tl.float32), pixels_y.to(tl.float32)
-    rest_x = (pixels_x - x.to(tl.int32)).to(tl.float32) - tl.load(splat + 2, mask=valid, other=0.0)
-    rest_y = (pixels_y - y.to(tl.int32)).to(tl.float32) - tl.load(splat + 3, mask=valid, other=0.0)
-    a = tl.load(splat + 4, mask=valid, other=0.0)
-    b = tl.load(splat + 5, mask=valid, other=0.0)
-    c = tl.load(splat + 6, mask=valid, other=0.0)
-    rest_a = tl.load(splat + 7, mask=valid, other=0.0)
-    rest_b = tl.load(splat + 8, mask=valid, other=0.0)
-    log_opacity = tl.load(splat + 9, mask=valid, other=-64.0)
+    rest_x = (pixels_x - x.to(tl.int32)).to(tl.float32) - center_x
+    rest_y = (pixels_y - y.to(tl.int32)).to(tl.float32) - center_y
     ax, by = a * x, b * y
     rest = tl.fma(a, x, -ax) + tl.fma(b, y, -by)
     rest = tl.fma(a, rest_x, tl.fma(b, rest_y, rest))
@@ -154,13 +166,11 @@ def load_color(splats, d, valid):
     """Read red, green, blue."""
     splat = splats + SPLAT * d
     red = tl.load(splat + 11, mask=valid, other=0.0)
-    green = tl.load(splat + 12, mask=valid, other=0.0)
-    blue = tl.load(splat + 13, mask=valid, other=0.0)
+    green, blue = load_two_floats(splat, 12, valid)
     return red, green, blue
 
 
 @kernel
 def load_depth(splats, d, valid):
     """Read a depth as a sum of two numbers."""
-    z = tl.load(splats + SPLAT * d + 14, mask=valid, other=0.0)
-    return z, tl.load(splats + SPLAT * d + 15, mask=valid, other=0.0)
+    return load_two_floats(splats + SPLAT * d, 14, valid)
