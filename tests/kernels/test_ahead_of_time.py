@@ -8,8 +8,11 @@ import re
 from collections import Counter
 
 import pytest
+from compiler import INTERPRETED
 
 pytest.importorskip("triton")
+if INTERPRETED:
+    pytest.skip("Triton interprets its kernels here", allow_module_level=True)
 
 from benchmarks.machine_code.cubin import (
     LANES,
