@@ -12,7 +12,7 @@ from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.network import TokenNetwork
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, Stage
+from asysplat.models.stage import Component, Stage, build
 from asysplat.models.tokenizer import Tokenizer
 
 APPEARANCE_MLP_RATIO = 4
@@ -77,23 +77,24 @@ class AsySplat(TokenNetwork):
         shapes = widths.stage_shapes(stage_ratios)
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = Branch(
-            Tokenizer(patch_coarse, widths.stages[0], self.pixel_channels),
+            build(Tokenizer, patch_coarse, widths.stages[0], self.pixel_channels),
             stages=(
-                Stage(previous.width, shape, layers, blocks)
+                build(Stage, previous.width, shape, layers, blocks)
                 for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
             ),
-            links=(fine_to_coarse(shape, fine) for shape in shapes),
+            links=(build(fine_to_coarse, shape, fine) for shape in shapes),
         )
         self.appearance = Branch(
-            Tokenizer(patch_fine, widths.fine, self.pixel_channels),
+            build(Tokenizer, patch_fine, widths.fine, self.pixel_channels),
             stages=(
-                Layers(appearance_block(fine) for _ in range(appearance_layers)) for _ in shapes
+                Layers(build(appearance_block, fine) for _ in range(appearance_layers))
+                for _ in shapes
             ),
-            links=(coarse_to_fine(shape, fine) for shape in shapes),
+            links=(build(coarse_to_fine, shape, fine) for shape in shapes),
         )
         # `source`, as the weights in checkpoints are named.
-        self.source = fusion(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
-        self.head = head(widths.stages[-1], patch_coarse, patch_fine)
+        self.source = build(fusion, widths.stages[-1], widths.fine, patch_coarse // patch_fine)
+        self.head = build(head, widths.stages[-1], patch_coarse, patch_fine)
 
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
@@ -174,7 +175,7 @@ def build_asysplat(
         return AsySplat(widths, appearance_layers=layers, **components)
 
     if geometry_ratio is not None:
-        with torch.device("meta"):
+        with torch.device("meta"), torch.random.fork_rng(devices=()):
             widths, appearance_layers = solve_widths(
                 build, widths, appearance_layers, geometry_ratio, parameter_budget
             )

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
+from typing import Any
 
 import torch
 from einops import rearrange
@@ -14,6 +15,17 @@ from asysplat.models.layers import Layers
 from asysplat.models.shapes import StageShape
 
 Component = Callable[..., nn.Module]
+
+
+def build(component: Component, *arguments: Any, **options: Any) -> nn.Module:
+    """Build a component from a random stream of its own, whose seed is the next random number.
+
+    So networks that differ in a component start with the same weights in all others.
+    """
+    seed = int(torch.randint(2**63 - 1, (), device="cpu"))
+    with torch.random.fork_rng(devices=()):
+        torch.default_generator.manual_seed(seed)
+        return component(*arguments, **options)
 
 
 class Stage(nn.Module):
@@ -48,7 +60,7 @@ class Stage(nn.Module):
         unused = merge and not has_global  # after a merge only global tokens are left to project
         self.project = nn.Identity() if same or unused else nn.Linear(previous_width, shape.width)
         letters = parse_layer_mix(layers, set(blocks))
-        self.layers = Layers(blocks[letter](shape) for letter in letters)
+        self.layers = Layers(build(blocks[letter], shape) for letter in letters)
 
     def forward(
         self,

@@ -1,5 +1,7 @@
 """The whole network: the paper's parameter counts, its inputs and components."""
 
+import re
+
 import pytest
 import torch
 from hydra.errors import InstantiationException
@@ -83,6 +85,27 @@ def test_a_parameter_budget_scales_the_total(build):
     net = build("geometry_ratio=0.8", "parameter_budget=0.5", device="meta")
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
     assert abs(total / expected - 0.5) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("overrides", "alike"),
+    [
+        ("model.layers=1m1t", r"geometry.*layers\.0|geometry\.(?!stages)|appearance|source|head"),
+        ("model/links=none", r"geometry|appearance|source|head"),
+        ("model/appearance=none", r"geometry|appearance\.tokenizer|source|head"),
+        ("model/fusion=fine", r"geometry|appearance"),
+        ("model.head.sh_degree=0", r"geometry|appearance|source"),
+    ],
+)
+def test_networks_that_differ_in_a_component_start_alike_in_the_others(build, overrides, alike):
+    states = []
+    for options in ((), (overrides,)):
+        torch.manual_seed(0)
+        states.append(build(*TINY, *options).state_dict())
+    base, other = states
+    shared = [name for name in base.keys() & other.keys() if re.match(alike, name)]
+    assert len(shared) > len(base) / 4
+    assert all(torch.equal(base[name], other[name]) for name in shared)
 
 
 @pytest.mark.parametrize(
