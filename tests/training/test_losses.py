@@ -222,17 +222,22 @@ def test_pixels_without_depth_do_not_count(rows):
     assert (terms["loss"] == 0) == (grad.abs().sum() == 0) == (rows == 32)
 
 
-@pytest.mark.parametrize("reading", [{}, {"depth_term": InputDisparity}])
-def test_data_without_depth_turns_the_term_off_with_one_warning(reading):
+@pytest.mark.parametrize(
+    ("term", "reason"),
+    [
+        (RenderedDisparity, "neither disparities nor depths; python -m"),
+        (InputDisparity, "neither disparities nor depths; python -m"),
+        (LogDepth, "no depths; training/depth=rendered takes disparities"),
+    ],
+)
+def test_data_without_depth_turns_the_term_off_with_one_warning(term, reason):
     prediction, batch = pair(depths=False)
-    loss = make_loss(mse=1.0, depth=1.0, **reading)
+    loss = make_loss(mse=1.0, depth=1.0, depth_term=term)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(3):
             assert "depth" not in loss(prediction, batch)
-    assert ["neither disparities nor depths" in str(warning.message) for warning in caught] == [
-        True
-    ]
+    assert [reason in str(warning.message) for warning in caught] == [True]
 
 
 @pytest.mark.medium

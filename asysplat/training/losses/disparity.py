@@ -20,6 +20,14 @@ from asysplat.training.prediction import Prediction
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEVIATION = 0.1  # of the median disparity
 MIN_DEPTH = 1e-2  # depths are clamped to it, as in Long-LRM
+NO_DISPARITIES = (
+    "the data has neither disparities nor depths; python -m asysplat.data.disparity estimates "
+    "disparities"
+)
+NO_DEPTHS = (
+    "the data has no depths; training/depth=rendered takes disparities, which "
+    "python -m asysplat.data.disparity estimates"
+)
 
 
 class RenderedDisparity:
@@ -30,6 +38,7 @@ class RenderedDisparity:
     """
 
     renders_depth = True
+    missing = NO_DISPARITIES
 
     def __init__(self, stride: int | None = None):
         self.stride = stride
@@ -54,6 +63,7 @@ class InputDisparity:
     """
 
     renders_depth = False
+    missing = NO_DISPARITIES
 
     def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
         """Compute the term; None if the inputs have neither disparities nor depths."""
@@ -70,6 +80,7 @@ class LogDepth:
     """
 
     renders_depth = False
+    missing = NO_DEPTHS
 
     def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
         """Compute the mean over scenes of the mean absolute difference; None without depths."""

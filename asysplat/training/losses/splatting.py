@@ -23,8 +23,8 @@ class SplattingLoss(nn.Module):
     Args:
         mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
-        allow_missing: turn off, with a warning, the depth term if the data has neither disparities
-            nor depths.
+        allow_missing: turn off, with a warning, the depth term if the data has no depths or
+            disparities for it.
 
     Raises:
         InputError: all terms are off, or, at the first batch, the depth term is missing and that is
@@ -93,11 +93,8 @@ class SplattingLoss(nn.Module):
                 terms["depth"] = depth
             elif not self._depth_checked:
                 self._depth_missing = True
-                report_missing(
-                    f"training.loss.depth={self.depth:g}: the data has neither disparities nor "
-                    "depths; python -m asysplat.data.disparity estimates disparities",
-                    self.allow_missing,
-                )
+                reason = f"training.loss.depth={self.depth:g}: {self._depth_term.missing}"
+                report_missing(reason, self.allow_missing)
             self._depth_checked = True
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}
 
