@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from einops import rearrange
@@ -15,9 +15,10 @@ from asysplat.models.layers import Layers
 from asysplat.models.shapes import StageShape
 
 Component = Callable[..., nn.Module]
+Built = TypeVar("Built", bound=nn.Module)
 
 
-def build(component: Component, *arguments: Any, **options: Any) -> nn.Module:
+def build(component: Callable[..., Built], *arguments: Any, **options: Any) -> Built:
     """Build a component from a random stream of its own, whose seed is the next random number.
 
     So networks that differ in a component start with the same weights in all others.

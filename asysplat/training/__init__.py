@@ -3,12 +3,14 @@
 from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.module import SplattingModule
+from asysplat.training.muon import Muon
 from asysplat.training.prediction import Prediction
 from asysplat.training.sharded import ShardedStrategy
 
 __all__ = [
     "InputDisparity",
     "LogDepth",
+    "Muon",
     "Prediction",
     "RenderedDisparity",
     "ShardedStrategy",

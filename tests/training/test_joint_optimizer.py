@@ -8,6 +8,7 @@ from torch import nn
 
 from asysplat.training.joint_optimizer import JointOptimizer
 from asysplat.training.module import block_matrices
+from asysplat.training.muon import Muon
 from asysplat.training.schedule import cosine
 
 
@@ -16,7 +17,7 @@ def make_joint():
     net = nn.Sequential(nn.Linear(6, 8), nn.Tanh(), nn.Linear(8, 3))
     matrices = [net[0].weight]
     others = [parameter for parameter in net.parameters() if parameter is not net[0].weight]
-    joint = JointOptimizer(torch.optim.AdamW(others, lr=0.01), torch.optim.Muon(matrices, lr=0.1))
+    joint = JointOptimizer(torch.optim.AdamW(others, lr=0.01), Muon(matrices, lr=0.1))
     return net, joint, cosine(joint, warmup_steps=2, total_steps=20)
 
 
@@ -35,7 +36,7 @@ def test_each_parameter_is_stepped_by_its_own_optimizer_at_its_own_rate():
     alone, _, _ = make_joint()
     parts = (
         torch.optim.AdamW([p for p in alone.parameters() if p is not alone[0].weight], lr=0.01),
-        torch.optim.Muon([alone[0].weight], lr=0.1),
+        Muon([alone[0].weight], lr=0.1),
     )
     schedules = [cosine(part, warmup_steps=2, total_steps=20) for part in parts]
     for step in range(6):
