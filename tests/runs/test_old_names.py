@@ -34,7 +34,10 @@ def overrides_of_today() -> list[str]:
     renamed = {old: f"{old.rpartition('.')[0]}.{new}" for old, new in KEYS.items()}
     pairs = [o.split("=", 1) for o in OmegaConf.load(OLD_RUN / ".hydra" / "overrides.yaml")]
     today = [f"{renamed.get(key, key)}={value}" for key, value in pairs]
-    return ["model=asysplat_plane_sweep", "model.head.sh_degree=1", *today]
+    defaults = ["model=asysplat_plane_sweep", "model.head.sh_degree=1"]
+    defaults += ["training/depth=every_second", "training.loss.depth=0.03"]
+    defaults += ["training/optimizer=adamw", "stages.stage1.learning_rate=1e-3"]
+    return [*defaults, *today]
 
 
 @pytest.fixture
