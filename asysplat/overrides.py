@@ -147,7 +147,7 @@ def _nearest(key: str, known: Collection[str]) -> str | None:
     if name in known:  # at the top: steps for trainer.steps
         return name
     ends: dict[str, str] = {}
-    for path in sorted(known, key=lambda path: (path.count("."), path)):
+    for path in sorted(known, key=lambda path: (path.count("."), len(path), path)):
         parts = path.split(".")
         for start in range(len(parts)):
             ends.setdefault(".".join(parts[start:]), path)

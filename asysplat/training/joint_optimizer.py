@@ -19,7 +19,7 @@ class JointOptimizer(Optimizer):
         super().__init__([group for part in optimizers for group in part.param_groups], {})
         self._share()
 
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Step every optimizer, after the closure has computed the gradients."""
         loss = None
         if closure is not None:

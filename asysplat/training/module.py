@@ -142,7 +142,7 @@ class SplattingModule(lightning.LightningModule):
         decayed = {"params": [p for p in trained if p in decay]}
         undecayed = {"params": [p for p in trained if p not in decay], "weight_decay": 0.0}
         optimizer = self.optimizer([decayed, undecayed])
-        if self.matrix_optimizer:
+        if self.matrix_optimizer and matrices:  # MVSplat has none
             optimizer = JointOptimizer(optimizer, self.matrix_optimizer(matrices))
         schedule = {"scheduler": self.schedule(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}

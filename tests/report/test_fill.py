@@ -74,10 +74,10 @@ def test_the_head_of_every_row_is_named(compose):
     def head(key, *overrides):
         return fill_table(load_paper()[key], overrides, compose, {}).notes["Head"]
 
-    assert head("layers") == "ResidualHead(sh_degree=3)"
+    assert head("layers") == "ResidualHead(sh_degree=0)"
     assert head("layers", "scale=paper") == "LongLRMHead(sh_degree=3, farthest=500.0)"
     own = "the model's own: MVSplat"
-    assert head("two_views") == f"{own}; ResidualHead(sh_degree=3): GS-LRM †, AsySplat"
+    assert head("two_views") == f"{own}; ResidualHead(sh_degree=0): GS-LRM †, AsySplat"
 
 
 @pytest.mark.medium

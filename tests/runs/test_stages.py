@@ -158,10 +158,11 @@ def test_a_run_of_three_stages_is_one_run(whole, logs, composed):
 def test_stages_share_weights_but_not_the_optimizer(whole):
     first, second, third = (saved_in(whole / name) for name in ("stage1", "stage2", "."))
     for stage in (first, second, third):
-        steps = {int(state["step"]) for state in stage["optimizer_states"][0]["state"].values()}
+        states = stage["optimizer_states"][0]["state"].values()
+        steps = {int(state["step"]) for state in states if "step" in state}  # Muon counts none
         assert steps == {stage["global_step"]} == {2}
     groups = [stage["optimizer_states"][0]["param_groups"][0] for stage in (first, third)]
-    assert [group["initial_lr"] for group in groups] == [1e-3, 1e-12]
+    assert [group["initial_lr"] for group in groups] == [5e-4, 1e-12]
     names = [name for name in second["state_dict"] if name.endswith("weight")]
     assert any(not torch.equal(first["state_dict"][n], second["state_dict"][n]) for n in names)
     for name in names:  # its rate moves nothing
