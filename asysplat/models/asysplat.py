@@ -12,7 +12,7 @@ from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.network import TokenNetwork
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, Stage, build
+from asysplat.models.stage import Component, Stage, build_component
 from asysplat.models.tokenizer import Tokenizer
 
 APPEARANCE_MLP_RATIO = 4
@@ -77,24 +77,26 @@ class AsySplat(TokenNetwork):
         shapes = widths.stage_shapes(stage_ratios)
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = Branch(
-            build(Tokenizer, patch_coarse, widths.stages[0], self.pixel_channels),
+            build_component(Tokenizer, patch_coarse, widths.stages[0], self.pixel_channels),
             stages=(
-                build(Stage, previous.width, shape, layers, blocks)
+                build_component(Stage, previous.width, shape, layers, blocks)
                 for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
             ),
-            links=(build(fine_to_coarse, shape, fine) for shape in shapes),
+            links=(build_component(fine_to_coarse, shape, fine) for shape in shapes),
         )
         self.appearance = Branch(
-            build(Tokenizer, patch_fine, widths.fine, self.pixel_channels),
+            build_component(Tokenizer, patch_fine, widths.fine, self.pixel_channels),
             stages=(
-                Layers(build(appearance_block, fine) for _ in range(appearance_layers))
+                Layers(build_component(appearance_block, fine) for _ in range(appearance_layers))
                 for _ in shapes
             ),
-            links=(build(coarse_to_fine, shape, fine) for shape in shapes),
+            links=(build_component(coarse_to_fine, shape, fine) for shape in shapes),
         )
         # `source`, as the weights in checkpoints are named.
-        self.source = build(fusion, widths.stages[-1], widths.fine, patch_coarse // patch_fine)
-        self.head = build(head, widths.stages[-1], patch_coarse, patch_fine)
+        self.source = build_component(
+            fusion, widths.stages[-1], widths.fine, patch_coarse // patch_fine
+        )
+        self.head = build_component(head, widths.stages[-1], patch_coarse, patch_fine)
 
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()

@@ -12,7 +12,7 @@ from asysplat.models.head import GaussianHead
 from asysplat.models.network import TokenNetwork
 from asysplat.models.prune import Prune
 from asysplat.models.shapes import Widths
-from asysplat.models.stage import Component, Stage, build
+from asysplat.models.stage import Component, Stage, build_component
 from asysplat.models.tokenizer import Tokenizer
 
 
@@ -49,10 +49,12 @@ class SingleBranch(TokenNetwork):
         prune: Prune | None = None,
     ):
         super().__init__(widths, patch * 2 ** sum(merges), prior, prune)
-        self.tokenizer = build(Tokenizer, patch, widths.stages[0], self.pixel_channels, bias=False)
+        self.tokenizer = build_component(
+            Tokenizer, patch, widths.stages[0], self.pixel_channels, bias=False
+        )
         shapes = widths.stage_shapes(stage_ratios, stage_layers=stage_layers, merges=merges)
         self.stages = nn.ModuleList(
-            build(Stage, previous.width, shape, layers, blocks, merge, global_tokens > 0)
+            build_component(Stage, previous.width, shape, layers, blocks, merge, global_tokens > 0)
             for previous, shape, layers, merge in zip(
                 [shapes[0], *shapes[:-1]], shapes, stage_layers, merges, strict=True
             )
@@ -67,7 +69,7 @@ class SingleBranch(TokenNetwork):
         if global_tokens:
             start = nn.init.trunc_normal_(torch.empty(global_tokens, shapes[0].width), std=0.02)
             self.global_tokens = nn.Parameter(start)
-        self.head = build(head, widths.stages[-1], self.patch, self.patch)
+        self.head = build_component(head, widths.stages[-1], self.patch, self.patch)
 
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()

@@ -18,7 +18,7 @@ Component = Callable[..., nn.Module]
 Built = TypeVar("Built", bound=nn.Module)
 
 
-def build(component: Callable[..., Built], *arguments: Any, **options: Any) -> Built:
+def build_component(component: Callable[..., Built], *arguments: Any, **options: Any) -> Built:
     """Build a component from a random stream of its own, whose seed is the next random number.
 
     So networks that differ in a component start with the same weights in all others.
@@ -61,7 +61,7 @@ class Stage(nn.Module):
         unused = merge and not has_global  # after a merge only global tokens are left to project
         self.project = nn.Identity() if same or unused else nn.Linear(previous_width, shape.width)
         letters = parse_layer_mix(layers, set(blocks))
-        self.layers = Layers(build(blocks[letter], shape) for letter in letters)
+        self.layers = Layers(build_component(blocks[letter], shape) for letter in letters)
 
     def forward(
         self,
