@@ -10,19 +10,19 @@ from torch.optim import Optimizer
 
 QUINTIC = (3.4445, -4.7750, 2.0315)  # Jordan's: singular values go to about 0.7 to 1.2
 STEPS = 5
-RMS = 0.2  # of a step at learning rate 1: about AdamW's
 
 
 class Muon(Optimizer):
     """Momentum whose singular values become about 1 (Jordan et al. 2024), for matrices only.
 
-    A step is as large as AdamW's at the same rate (Liu et al. 2025, "Muon is scalable", Eq. 4).
     torch.optim.Muon does the same matrix by matrix, in bfloat16, which most CPUs emulate; here
     matrices of one shape are multiplied together, in float32 on a CPU: 3.5 times as fast.
 
     Args:
         params: matrices [m, n].
         lr: learning rate.
+        rms: root mean square of a step at learning rate 1; 0.2 is about that of AdamW's in a long
+            training (Liu et al. 2025, "Muon is scalable", Eq. 4).
         momentum: decay of the mean of gradients; Nesterov's.
         weight_decay: fraction of the learning rate by which weights shrink in a step.
     """
@@ -31,10 +31,12 @@ class Muon(Optimizer):
         self,
         params: Iterable[Tensor],
         lr: float = 1e-3,
+        rms: float = 0.2,
         momentum: float = 0.95,
         weight_decay: float = 0.0,
     ):
-        super().__init__(params, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
+        defaults = {"lr": lr, "rms": rms, "momentum": momentum, "weight_decay": weight_decay}
+        super().__init__(params, defaults)
 
     @torch.no_grad()
     def step(self) -> None:
@@ -49,7 +51,7 @@ class Muon(Optimizer):
                 ahead = [self._look_ahead(matrix, group["momentum"]) for matrix in matrices]
                 steps = orthogonalize(torch.stack(ahead)).to(ahead[0].dtype)
                 for matrix, step in zip(matrices, steps, strict=True):
-                    matrix.mul_(kept).sub_(step, alpha=lr * RMS * max(shape) ** 0.5)
+                    matrix.mul_(kept).sub_(step, alpha=lr * group["rms"] * max(shape) ** 0.5)
 
     def _look_ahead(self, matrix: Tensor, decay: float) -> Float[Tensor, "m n"]:
         """Update a matrix's momentum; return it with the gradient added once more (Nesterov)."""
