@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -165,7 +165,8 @@ class Viewer:
         # The share button would open the viewer to anyone, through a server of viser's.
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._layer = gui.add_dropdown("Layer", LAYERS)
-        self._sh_degree = gui.add_slider("SH degree", 0, 3, 1, 3)
+        # A float: viser could not send on to other pages the whole number of any float.
+        self._sh_degree = gui.add_slider("SH degree", 0.0, 3.0, 1.0, 3.0)
         self._min_opacity = gui.add_slider("Minimum opacity", 0.0, 1.0, 0.01, 0.0)
         self._size = gui.add_slider("Size", 0.05, 1.0, 0.05, 1.0)
         self._antialiased = gui.add_checkbox("Antialiased", antialiased)
@@ -256,7 +257,7 @@ class Viewer:
         try:
             camera, in_full = viewer_cameras.client_camera(client.camera, max_pixels)
             camera = camera.to(gaussians.means.device)
-            image = draw_layer(gaussians, camera, *(handle.value for handle in self._settings))
+            image = draw_layer(gaussians, camera, **self._options())
             if client.client_id not in self._server.get_clients():  # closed meanwhile
                 return True
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
@@ -268,6 +269,17 @@ class Viewer:
         milliseconds = 1000 * (time.perf_counter() - start)
         self._text.content = f"{size} in {milliseconds:.0f} ms\n\n{text}"
         return in_full
+
+    def _options(self) -> dict[str, Any]:
+        """Return the panel's options of `draw_layer`, valid whatever a page has sent."""
+        layer = self._layer.value
+        return {
+            "layer": layer if layer in LAYERS else LAYERS[0],
+            "sh_degree": round(_bounded(self._sh_degree)),
+            "min_opacity": _bounded(self._min_opacity),
+            "size": _bounded(self._size),
+            "antialiased": self._antialiased.value,
+        }
 
 
 @contextmanager
@@ -319,6 +331,10 @@ def draw_layer(
         return colors[(255 * values.clamp(0, 1)).round().byte().cpu().numpy()]
     alpha = rendering.alpha[0].expand(3, -1, -1)
     return _bytes(alpha if layer == "alpha" else rendering.image[0].clamp(0, 1))
+
+
+def _bounded(slider: "viser.GuiSliderHandle[float]") -> float:
+    return float(np.clip(np.nan_to_num(slider.value), slider.min, slider.max))
 
 
 def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "H W 3"]:

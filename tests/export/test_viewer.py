@@ -1,6 +1,7 @@
 """The viewer: images for its pages, changes of the scene, pages that come and go."""
 
 import json
+import math
 import sys
 import time
 from dataclasses import replace
@@ -148,11 +149,11 @@ def test_the_newest_scene_wins_and_show_does_not_block(scene, monkeypatch):
     gaussians, views = scene
     drawn, started, turn = [], Event(), Event()
 
-    def slow(gaussians, *rest):
+    def slow(gaussians, *rest, **options):
         drawn.append(gaussians.num_gaussians)
         started.set()
         assert turn.wait(60)
-        return draw_layer(gaussians, *rest)
+        return draw_layer(gaussians, *rest, **options)
 
     monkeypatch.setattr("asysplat.export.viewer.draw_layer", slow)
     with Viewer(views, port=0) as viewer, open_page(viewer) as page:
@@ -192,6 +193,27 @@ def test_the_sh_degree_follows_the_scene(scene, viewer):
     assert viewer._sh_degree.value == 1
 
 
+def test_no_value_of_one_page_blinds_the_others(scene, viewer):
+    gaussians, _ = scene
+    shown, cameras = inside(viewer, gaussians)
+    wild = (-1, 10**12, 1e300, math.nan, math.inf, -math.inf)
+    with open_page(viewer) as stranger, open_page(viewer) as page:
+        for each, view in ((stranger, 1), (page, 0)):
+            each.stand(cameras, view)
+        until(lambda: len(viewer._server.get_clients()) == 2)
+        for value in wild:
+            for slider in (viewer._sh_degree, viewer._min_opacity, viewer._size):
+                stranger.set(slider, value)
+                until(lambda slider=slider, value=value: repr(slider.value) == repr(float(value)))
+        stranger.set(viewer._layer, "none")
+        until(lambda: viewer._layer.value == "none")
+        least = {"sh_degree": 0, "min_opacity": 0.0, "size": 0.05}
+        page.picture_like(draw_layer(shown, cameras.select([0]), **least))
+        assert len(viewer._server.get_clients()) == 2
+        stranger.set(viewer._size, 1.0)
+        page.picture_like(draw_layer(shown, cameras.select([0]), sh_degree=0))
+
+
 def test_errors_are_in_the_panel_until_the_next_scene(scene, viewer, monkeypatch):
     gaussians, _ = scene
     shown, cameras = inside(viewer, gaussians)
@@ -212,9 +234,9 @@ def test_coarse_after_a_change_and_in_full_at_rest(scene, monkeypatch):
     gaussians, views = scene
     pixels = []
 
-    def draw(gaussians, camera, *rest):
+    def draw(gaussians, camera, **options):
         pixels.append(camera.height * camera.width)
-        return draw_layer(gaussians, camera, *rest)
+        return draw_layer(gaussians, camera, **options)
 
     monkeypatch.setattr("asysplat.export.viewer.draw_layer", draw)
     with Viewer(views, gaussians, port=0) as viewer, open_page(viewer) as page:
