@@ -36,7 +36,12 @@ from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import find_views
-from asysplat.refinement import RefinementSettings, refine
+from asysplat.refinement import (
+    RefinementSettings,
+    ScaffoldSettings,
+    refine,
+    refine_scaffold,
+)
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
 from asysplat.runs.device import find_device
@@ -59,8 +64,11 @@ def reconstruct(config: DictConfig) -> None:
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
     settings = instantiate(config.refinement)
+    per_view = isinstance(settings, ScaffoldSettings)
+    if per_view:
+        config = without_scene_files(config, given_options())
     device = find_device(config.device)
-    results = Results(Path(config.paths.run), config)
+    results = Results(Path(config.paths.run), config, per_view)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     options = {name: config[name] for name in names}
     where = Path(config.paths.logs) / "cameras"
@@ -75,6 +83,11 @@ def reconstruct(config: DictConfig) -> None:
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(Viewer(photographs.inputs) if config.view else None) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}
+        if per_view:
+            anchors = refine_scaffold(gaussians, photographs.inputs, settings, **options)
+            results.save(anchors, display.last)
+            results.save_video(anchors)
+            return
         gaussians = refine(gaussians, photographs.inputs, settings, **options)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
@@ -84,6 +97,26 @@ def reconstruct(config: DictConfig) -> None:
             results.save_scene(gaussians)
         results.save_video(gaussians)
         display.show(gaussians)
+
+
+def without_scene_files(config: DictConfig, given: set[str]) -> DictConfig:
+    """Return the configuration for Gaussians that depend on the view, which no file holds."""
+    refused = {
+        f"output=[{','.join(config.output)}]": "output" in given and config.output,
+        "view=true": config.view,
+        "open=true": config.open,
+        "video.path=orbit": config.video.path == "orbit",
+        f"last_fit={config.last_fit}": config.last_fit,
+    }
+    for option, is_refused in refused.items():
+        if is_refused:
+            raise InputError(
+                f"{option}: the Gaussians of refinement=scaffold_gs depend on the view, so no file "
+                "or viewer holds them: leave it out, for metrics, pictures and a video."
+            )
+    config = config.copy()
+    config.output = []
+    return config
 
 
 def describe(config: DictConfig, photographs: Photographs, limit: dict[str, float]) -> str:
@@ -138,7 +171,7 @@ def read_limit(config: DictConfig) -> dict[str, float]:
 
 
 def initialize(
-    config: DictConfig, photographs: Photographs, settings: RefinementSettings
+    config: DictConfig, photographs: Photographs, settings: RefinementSettings | ScaffoldSettings
 ) -> Gaussians:
     """Build the Gaussians to refine, in the network's frame, on the photographs' device."""
     init, network, device = config.init, None, photographs.inputs.images.device

@@ -276,6 +276,23 @@ def test_a_scene_is_written_in_the_formats_of_output(command, photographs, tmp_p
 
 
 @pytest.mark.medium
+def test_scaffold_gs_has_metrics_and_pictures_but_no_scene_file(
+    command, run_script, photographs, tmp_path
+):
+    folder = tmp_path / "run"
+    options = ("refinement=scaffold_gs", "init=depth", "refinement.voxel=0.02")
+    said = finished(command(photographs, *options, "steps=150", "refinement.max_gaussians=20000"))
+    assert {path.name for path in folder.iterdir()} == FILES - {
+        name for name in FILES if name.startswith("scene.")
+    }
+    assert "scene:" not in said
+    numbers = numbers_of(folder)
+    assert numbers["steps"] == 150 and numbers["gaussians"] <= 20_000
+    assert numbers["held_out/psnr"] > numbers["baseline/nearest_view/psnr"] + 1
+    check_refusal(run_script("reconstruct.py", f"run={folder}"), "has no scene.safetensors")
+
+
+@pytest.mark.medium
 def test_a_run_goes_on_from_a_finished_one(command, run_script, photographs, tmp_path):
     small = ("height=40", "views=5", "held_out_every=4", "video.path=none")
     finished(command(photographs, *small))
@@ -408,6 +425,9 @@ REFUSED = {
     "refinement.densify_until=2.5": "refinement.densify_until=2.5: give 0 to 1",
     "output=[ply,obj]": "output has 'obj': choose from compressed.ply, ply, spz, sog, glb, splat,",
     "output=[ply] open=true": "open=true opens the page, which output= leaves out: add html to it",
+    "refinement=scaffold_gs output=[ply]": "output=[ply]: the Gaussians of refinement=scaffold_gs "
+    "depend on the view, so no file or viewer holds them: leave it out",
+    "refinement=scaffold_gs last_fit=0.2": "last_fit=0.2: the Gaussians of refinement=scaffold_gs",
     "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
 }
 

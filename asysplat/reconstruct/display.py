@@ -9,7 +9,7 @@ from rich import progress
 from rich.console import Console
 
 from asysplat.export.viewer import Viewer
-from asysplat.refinement.refine import Refinement, RefinementProgress
+from asysplat.refinement.refine import Refinement, RefinementProgress, Refining
 from asysplat.scene import Gaussians
 
 VIEWER_SECONDS = 1.0  # between two updates of the viewer
@@ -52,8 +52,8 @@ class RefinementDisplay:
         if self._viewer is not None:
             self._viewer.close()
 
-    def __call__(self, progress: RefinementProgress, refinement: Refinement) -> bool:
-        """Show the progress; return whether to stop."""
+    def __call__(self, progress: RefinementProgress, refinement: Refining) -> bool:
+        """Show the progress, and Gaussians that all views share; return whether to stop."""
         self.last = progress
         text = (
             f"step {progress.step}, PSNR {progress.psnr:.2f} dB, {progress.gaussians:,} Gaussians"
@@ -63,7 +63,8 @@ class RefinementDisplay:
         if not self._terminal and clock - self._printed > PRINT_SECONDS:
             self._printed = clock
             print(f"{progress.seconds:.0f} s: {text}", flush=True)
-        if self._viewer is not None and clock - self._shown > VIEWER_SECONDS:
+        shown = self._viewer is not None and isinstance(refinement, Refinement)
+        if shown and clock - self._shown > VIEWER_SECONDS:
             self._shown = clock
             self._viewer.show(refinement.gaussians, text)
         return self.stopped

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
@@ -28,11 +28,11 @@ from asysplat.export.page import PAGE
 from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
-from asysplat.refinement.refine import RefinementProgress
-from asysplat.rendering import render
+from asysplat.refinement import AnchorScene, RefinementProgress
+from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import SCENE
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.terminal import print_table
 
 BYTES_PER_GAUSSIAN = 4 * 62  # size in one of the files, at most
@@ -43,18 +43,24 @@ SHEET_ROWS = 4  # views in a contact sheet
 class Results:
     """Write the result folder of a reconstruction, with the configuration conf/reconstruct.yaml.
 
+    Args:
+        folder: a new folder is created there.
+        config: the configuration.
+        per_view: the Gaussians depend on the view, so that no scene file holds them.
+
     Raises:
         InputError: an unknown camera path of the video; a folder that cannot be created.
     """
 
-    def __init__(self, folder: Path, config: DictConfig):
+    def __init__(self, folder: Path, config: DictConfig, per_view: bool = False):
         check_writable(folder.parent, "paths.logs")
         self.folder, self._config = folder, config
         self._protocol = instantiate(config.metrics)
         self._lpips = load_lpips(
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
-        self._suffixes = [*read_outputs(config.output), Path(SCENE).suffix]
+        always = [] if per_view else [Path(SCENE).suffix]
+        self._suffixes = [*read_outputs(config.output), *always]
         self._suffixes.sort(key=lambda suffix: suffix == PAGE)  # the scene's files first
         if config.open and PAGE not in self._suffixes:
             raise InputError("open=true opens the page, which output= leaves out: add html to it.")
@@ -109,38 +115,39 @@ class Results:
             names = [Path(file).name for file in photographs.input_files]
             write_page(path, world, cameras, names, Path(self._config.path).name, background)
 
-    def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
+    def save(self, scene: Gaussians | AnchorScene, progress: RefinementProgress) -> None:
         """Write the scene files, then cameras, the configuration, a contact sheet and metrics.
 
         Raises:
             InputError: see `save_scene`.
         """
-        self.save_scene(gaussians)
+        if isinstance(scene, Gaussians):
+            self.save_scene(scene)
         self._save_cameras()
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
-        self._save_contact_sheet("contact.png", gaussians)
-        self._save_metrics(gaussians, progress)
+        self._save_contact_sheet("contact.png", scene)
+        self._save_metrics(scene, progress)
 
-    def save_video(self, gaussians: Gaussians) -> None:
+    def save_video(self, scene: Gaussians | AnchorScene) -> None:
         """Write the video, print where the results are, and open the page on request."""
-        photographs, background = self._photographs, self._background
+        photographs = self._photographs
         if self._has_video:
-            path = video_cameras(self._config.video, photographs, gaussians)
+            path = video_cameras(self._config.video, photographs, scene)
             images = (
-                render(gaussians, path.select([frame]), background, depth=False).image[0]
+                self._draw(scene, path.select([frame]), depth=False).image[0]
                 for frame in range(path.num_views)
             )
             write_video(self.folder / "path.mp4", images, self._config.video.fps)
-        if any(photographs.origin):
+        if any(photographs.origin) and self._suffixes:
             offset = " ".join(map(repr, photographs.origin))
             print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
         print(f"figure: {self.folder / 'contact.png'}")
         if self._has_video:
             print(f"video: {self.folder / 'path.mp4'}")
         files = [self.folder / f"scene{suffix}" for suffix in self._suffixes]
-        scene = next(file for file in files if file.suffix != PAGE)
-        print(f"viewer: asysplat view {scene}")
-        print(f"scene: {scene}")
+        for file in [file for file in files if file.suffix != PAGE][:1]:
+            print(f"viewer: asysplat view {file}")
+            print(f"scene: {file}")
         for page in (file for file in files if file.suffix == PAGE):
             print(f"page: {page}")
             if self._config.open:
@@ -154,9 +161,20 @@ class Results:
         with atomic_write(self.folder / CAMERAS) as path:
             path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 
-    def _save_metrics(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
+    def _draw(
+        self,
+        scene: Gaussians | AnchorScene,
+        cameras: Cameras,
+        masks: Bool[Tensor, "V H W"] | None = None,
+        depth: bool = True,
+    ) -> Rendering:
+        if isinstance(scene, AnchorScene):
+            return scene.render(cameras, self._background, masks=masks, depth=depth)
+        return render(scene, cameras, self._background, depth=depth, masks=masks, views_at_once=1)
+
+    def _save_metrics(self, scene: Gaussians | AnchorScene, progress: RefinementProgress) -> None:
         """Write metrics.json and metrics.csv, and print the table."""
-        results: dict[str, float | int | str] = {"gaussians": gaussians.num_gaussians}
+        results: dict[str, float | int | str] = {"gaussians": scene.num_gaussians}
         results |= {"steps": progress.step, "seconds": progress.seconds}
         descriptions = self._protocol.describe()
         results |= {f"protocol/{name}": description for name, description in descriptions.items()}
@@ -166,7 +184,7 @@ class Results:
         if held_out is not None:
             sets["held_out"] = (held_out, photographs.held_out_files)
         for name, (views, files) in sets.items():
-            numbers = self._measure(gaussians, views)
+            numbers = self._measure(scene, views)
             results |= _means(name, numbers)
             labels = ({"set": name, "file": file} for file in files)
             rows += [label | row for label, row in zip(labels, numbers, strict=True)]
@@ -179,23 +197,23 @@ class Results:
         _print_table(results)
 
     @torch.no_grad()
-    def _measure(self, gaussians: Gaussians, views: Views) -> list[dict[str, float]]:
+    def _measure(self, scene: Gaussians | AnchorScene, views: Views) -> list[dict[str, float]]:
         """Compute the metrics of [V] views, which are rendered one by one to save memory."""
         rows = []
         for view in range(views.num_views):
             target = views.select([view])
-            drawn = render(gaussians, target.cameras, self._background, masks=target.masks)
+            drawn = self._draw(scene, target.cameras, masks=target.masks)
             rows += self._protocol.measure_views(drawn.image, drawn.depth, target, self._lpips)
         return rows
 
     @torch.no_grad()
-    def _save_contact_sheet(self, name: str, gaussians: Gaussians) -> None:
+    def _save_contact_sheet(self, name: str, scene: Gaussians | AnchorScene) -> None:
         """Draw some held-out views, or inputs without any: image, rendering, error and depth."""
         inputs, held_out = self._photographs.inputs, self._photographs.held_out
         views = inputs if held_out is None else held_out
         rows = min(SHEET_ROWS, views.num_views)
         views = views.select(torch.linspace(0, views.num_views - 1, rows).round().long())
-        rendering = render(gaussians, views.cameras, self._background, views_at_once=1)
+        rendering = self._draw(scene, views.cameras)
         figure = comparison_figure(inputs, views, rendering)
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)

@@ -12,6 +12,7 @@ from torch import Tensor
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.export import orbit, smoothed_path
+from asysplat.refinement import AnchorScene
 from asysplat.rendering import render
 from asysplat.runs.ranges import is_number, is_whole
 from asysplat.scene import Cameras, Gaussians
@@ -70,8 +71,12 @@ def _find_view(name: str, files: Sequence[str]) -> int:
     )
 
 
-def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussians) -> Cameras:
+def video_cameras(
+    video: DictConfig, photographs: Photographs, scene: Gaussians | AnchorScene
+) -> Cameras:
     """Build the cameras of all frames, of the configured path and height.
+
+    An orbit needs Gaussians.
 
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """
@@ -79,8 +84,8 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     cameras = photographs.cameras.select(
         find_views(video, photographs.input_files, photographs.held_out_files)
     )
-    if video.path == "orbit":
-        path = orbit(cameras, frames, subject(gaussians, cameras), gaussians)
+    if video.path == "orbit" and isinstance(scene, Gaussians):
+        path = orbit(cameras, frames, subject(scene, cameras), scene)
     else:
         path = smoothed_path(cameras, frames, as_given=video.path != "own")
     if video.height is None:

@@ -2,6 +2,7 @@
 
 from asysplat.refinement.merge import merge_to_limit
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine
+from asysplat.refinement.scaffold_gs import AnchorScene, ScaffoldSettings, refine_scaffold
 from asysplat.refinement.settings import (
     PAPER,
     PUBLISHED_3DGS,
@@ -13,11 +14,14 @@ from asysplat.refinement.settings import (
 __all__ = [
     "PAPER",
     "PUBLISHED_3DGS",
+    "AnchorScene",
     "Rates",
     "Refinement",
     "RefinementProgress",
     "RefinementSettings",
+    "ScaffoldSettings",
     "StepSchedule",
     "merge_to_limit",
     "refine",
+    "refine_scaffold",
 ]

@@ -13,6 +13,7 @@ from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
+from asysplat.refinement.scaffold_gs import ScaffoldSettings
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import INRIA
 from asysplat.scene import Gaussians, Views
@@ -29,14 +30,14 @@ POINT_OPACITY = 0.1
 def initial_gaussians(
     init: str,
     photographs: Photographs,
-    settings: RefinementSettings,
+    settings: RefinementSettings | ScaffoldSettings,
     network: Network | None = None,
 ) -> Gaussians:
     """Build the Gaussians that a refinement with `settings` starts from, in the network's frame.
 
     Of many views, those of DEPTH_VIEWS, evenly selected. Gaussians of several views on the same
     surface are merged, in cells of a pixel of the network's input or of the prior's depth map, or
-    larger ones: `RefinementSettings.initial_limit`.
+    larger ones: `settings.initial_limit`.
 
     Raises:
         InputError: `init` is none of INITS, or needs points or depths that the photographs lack, or

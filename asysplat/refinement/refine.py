@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -40,6 +41,20 @@ class RefinementProgress:
     seconds: float  # since its start
     psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
+
+
+@runtime_checkable
+class Refining(Protocol):
+    """What `run_steps` drives."""
+
+    views: Views
+
+    @property
+    def num_gaussians(self) -> int: ...
+
+    def advance(self, progress: float) -> float:
+        """Take a step at a progress in [0, 1]; return its mean squared error."""
+        ...
 
 
 class Refinement:
@@ -78,7 +93,7 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = self._random_order()
-        self._steps = 0
+        self._steps = self._rounds = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
 
@@ -86,6 +101,22 @@ class Refinement:
     def gaussians(self) -> Gaussians:
         """The current Gaussians, copied."""
         return self.fields.gaussians().map(lambda field: field.detach().clone())
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.fields)
+
+    def advance(self, progress: float) -> float:
+        """Densify where that is due, then take a step; see `step`."""
+        settings, schedule = self.settings, self.settings.every
+        if progress < settings.densify_until:
+            due = rounds_until(self._steps, progress, settings)
+            if due > self._rounds:
+                self.densify(progress, due)
+                self._rounds = due
+            if schedule and self._steps and self._steps % schedule.opacity_reset == 0:
+                self.reset_opacities()
+        return self.step(progress)
 
     def step(self, progress: float) -> float:
         """Take a step at a progress in [0, 1]; return its mean squared error."""
@@ -206,38 +237,53 @@ def refine(
         >>> views = open_photographs("my_scene", height=64, views=4).inputs
         >>> gaussians = refine(load("shipped")(views), views, steps=5)
     """
-    budgets = [budget for budget in (seconds, steps) if budget is not None]
-    if len(budgets) != 1 or not budgets[0] > 0:
-        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
+    budget = read_budget(seconds, steps)
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:  # a step with few Gaussians compiles the kernels before the time runs
         few, one_view = gaussians.map(lambda field: field[:10]), replace(settings, views_per_step=1)
         small = Refinement(few, views.select([0]), settings=one_view)
         small.step(0.0)
         small.densify(0.0)
-    max_steps = settings.max_steps(views.num_views)
-    errors: deque[float] = deque(maxlen=views.num_views)
-    step, rounds, progress = 0, 0, 0.0
+    run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
+    return refinement.gaussians
+
+
+@dataclass(frozen=True)
+class Budget:
+    """So many steps, or seconds."""
+
+    amount: float | int
+    timed: bool  # seconds
+
+
+def read_budget(seconds: float | int | None, steps: int | None) -> Budget:
+    """Return the one that is given, or raise InputError."""
+    budgets = [budget for budget in (seconds, steps) if budget is not None]
+    if len(budgets) != 1 or not budgets[0] > 0:
+        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
+    return Budget(budgets[0], timed=steps is None)
+
+
+def run_steps(
+    refinement: Refining,
+    budget: Budget,
+    watch: Callable[[RefinementProgress, Any], bool] | None,
+    max_steps: float = math.inf,
+) -> None:
+    """Advance a refinement to the end of its budget, or for `max_steps`; see `refine`."""
+    errors: deque[float] = deque(maxlen=refinement.views.num_views)
+    step, progress = 0, 0.0
     clock = time.perf_counter()
     while progress < 1:
-        densifying = progress < settings.densify_until
-        due = rounds_until(step, progress, settings) if densifying else 0
-        if due > rounds:
-            refinement.densify(progress, due)
-            rounds = due
-        schedule = settings.every
-        if schedule and step and step % schedule.opacity_reset == 0 and densifying:
-            refinement.reset_opacities()
-        errors.append(refinement.step(progress))
+        errors.append(refinement.advance(progress))
         step += 1
         passed = time.perf_counter() - clock
-        used = (step if seconds is None else passed) / budgets[0]
+        used = (passed if budget.timed else step) / budget.amount
         progress = min(1.0, max(used, step / max_steps))
         psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
-        status = RefinementProgress(step, progress, passed, psnr, len(refinement.fields))
+        status = RefinementProgress(step, progress, passed, psnr, refinement.num_gaussians)
         if watch is not None and watch(status, refinement):
             break
-    return refinement.gaussians
 
 
 def rounds_until(step: int, progress: float, settings: RefinementSettings) -> int:

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.refinement import PAPER, PUBLISHED_3DGS, RefinementSettings
+from asysplat.refinement import PAPER, PUBLISHED_3DGS, RefinementSettings, ScaffoldSettings
 from asysplat.report.paper import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -54,6 +54,7 @@ def test_a_choice_composes_and_builds_its_model(build, choice):
 def test_refinement_files_equal_the_defaults_of_the_code(composed):
     names = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
     coded = {"default": RefinementSettings(), "paper": PAPER, "3dgs": PUBLISHED_3DGS}
+    coded |= {"scaffold_gs": ScaffoldSettings()}
     assert names == coded.keys()
     for name, expected in coded.items():
         config = composed(f"refinement={name}", script="reconstruct")

@@ -73,22 +73,15 @@ class ScreenGradients:
 
     @torch.no_grad()
     def add(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
-        """Accumulate the gradients of the offsets from one view.
-
-        Only the projection of the center is considered, not the change of the splat's shape. The
-        gradients are 0 where a Gaussian is not visible.
-        """
+        """Accumulate the gradients of the offsets from one view, 0 where a Gaussian is hidden."""
         visible = gradients.any(dim=1)
-        pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
         gaussians = self.fields.gaussians()
         means, scales = gaussians.means[visible], gaussians.scales[visible].amax(-1)
-        across = (gradients[visible] / self.fields.units[visible, None]) @ pose[:3, :2]
-        depth = (means - pose[:3, 3]) @ pose[:3, 2]
-        half = gradients.new_tensor([cameras.width / 2, cameras.height / 2])
-        screen = across * depth[:, None] / intrinsics.diagonal()[:2] * half
-        self._sums[visible] += screen.norm(dim=1)
+        of_means = gradients[visible] / self.fields.units[visible, None]
+        norms, depth = screen_gradients(means, of_means, cameras)
+        self._sums[visible] += norms
         self._counts[visible] += 1
-        radii = 3 * scales * intrinsics[0, 0] / depth
+        radii = 3 * scales * cameras.intrinsics[0, 0, 0] / depth
         self._radii[visible] = torch.maximum(self._radii[visible], radii)
 
     @torch.no_grad()
@@ -127,3 +120,22 @@ class ScreenGradients:
         fields.append(gaussians.map(lambda field: field[cloned]), units[cloned])
         fields.append(halves, units[twice])
         self._reset()
+
+
+def screen_gradients(
+    means: Float[Tensor, "N 3"], gradients: Float[Tensor, "N 3"], cameras: Cameras
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """Compute norms of the gradients of centers' image positions, and the centers' depths.
+
+    Only the projection of the center is considered, not the change of the splat's shape.
+
+    Args:
+        means: centers that the view shows.
+        gradients: gradients of `means`.
+        cameras: the view; its image has sides [-1, 1].
+    """
+    pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
+    depth = (means - pose[:3, 3]) @ pose[:3, 2]
+    half = gradients.new_tensor([cameras.width / 2, cameras.height / 2])
+    screen = (gradients @ pose[:3, :2]) * depth[:, None] / intrinsics.diagonal()[:2] * half
+    return screen.norm(dim=1), depth
