@@ -7,6 +7,7 @@ functions that read raise an InputError for a file that is missing, empty, damag
 
 import hashlib
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -320,7 +321,7 @@ def _register_heif() -> bool:
 
 
 def _check_exists(path: Path) -> None:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path} does not exist: put the image there, or leave it out.")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes): copy it again, or leave it out.")

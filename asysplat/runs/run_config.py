@@ -25,8 +25,8 @@ def read_config(path: Path) -> DictConfig:
     cache and downloads are not the run's to choose: there is no cache, and nothing is downloaded.
 
     Raises:
-        InputError: the file cannot be read, has a `_target_` that no file of conf/ has, or an
-            interpolation, which could hide one.
+        InputError: the file cannot be read, has a `_target_` that no file of conf/ has, values
+            without names, or an interpolation, which could hide any.
     """
     check_regular(path)
     try:
@@ -84,6 +84,11 @@ def _check_targets(path: Path, node: object, key: str = "") -> None:
                 "those classes; if it is one of yours, name it in a file of conf/."
             )
         _check_targets(path, value, inner)
+        if name == "_args_":
+            raise InputError(
+                f"{path}: {inner}: a run's configuration names its values, as `cache` and "
+                "`download` are not its own."
+            )
 
 
 @cache

@@ -89,6 +89,14 @@ def test_caches_and_downloads_are_not_the_runs(run, tmp_path):
     assert config.training.loss.more[0].download is False
 
 
+def test_values_without_names_are_refused(run):
+    """As they could be a cache or a download."""
+    vgg16 = {"_target_": "asysplat.training.losses.perceptual.vgg16", "_args_": [None, True]}
+    file = run(lambda content: content["training"]["loss"].update(perceptual_distance=vgg16))
+    with pytest.raises(InputError, match=r"perceptual_distance\._args_: a run's configuration"):
+        read_config(file.parents[1] / "config.yaml")
+
+
 @pytest.mark.parametrize("content", ["[1, 2]", "a: {", "1", "", "a: !!python/object:os.system {}"])
 def test_a_damaged_file_is_named(tmp_path, content):
     (tmp_path / "config.yaml").write_text(content)

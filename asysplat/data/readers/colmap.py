@@ -124,7 +124,7 @@ def _lens(camera: pycolmap.Camera, where: str) -> Lens:
 
 def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
     counts = {
-        folder: sum((scene / folder / name).is_file() for name in names) for folder in FOLDERS
+        folder: sum(common.has_file(scene / folder / name) for name in names) for folder in FOLDERS
     }
     best = max(counts, key=lambda folder: counts[folder])
     if counts[best] == 0:

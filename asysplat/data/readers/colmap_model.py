@@ -151,7 +151,7 @@ def _check_count(file: Path, count: int) -> None:
     with file.open(encoding="utf-8", errors="replace") as lines:
         header = "".join(line for _, line in zip(range(4), lines, strict=False))
     expected = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)
-    if expected and int(expected[1]) != count:
+    if expected and (expected[1].lstrip("0") or "0") != str(count):
         raise InputError(
             f"{file} holds {count} entries and its header gives {expected[1]}: it is cut short, so "
             "copy it again, or correct the header."

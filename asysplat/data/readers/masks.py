@@ -5,7 +5,7 @@ from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import has_alpha
-from asysplat.data.readers.common import check_map_size
+from asysplat.data.readers.common import check_map_size, has_file
 from asysplat.data.sequence import PosedImage, PosedScene
 
 FOLDER = "masks"
@@ -41,6 +41,6 @@ def find_mask(photograph: Path) -> Path | None:
     else:
         masks = images.parent / FOLDER / folder.relative_to(images)
     for name in (f"{photograph.name}.png", f"{photograph.stem}.png", photograph.name):
-        if (masks / name).is_file():
+        if has_file(masks / name):
             return masks / name
     return photograph if has_alpha(photograph) else None

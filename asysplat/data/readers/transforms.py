@@ -72,9 +72,13 @@ def read_images(
     def read(index: int, entry: Any) -> PosedImage:
         where = common.frame_label(file, index, entry)
         image = folder / entry["file_path"]
+        if not image.name:
+            raise InputError(f"{where} has the file_path {image}: name its image.")
         # The path may lack the file's extension.
         names = (image.name + suffix for suffix in ("", ".png", ".jpg"))
-        image = next((path for name in names if (path := image.with_name(name)).is_file()), image)
+        image = next(
+            (path for name in names if common.has_file(path := image.with_name(name))), image
+        )
         size = image_size(image)
         if not ("w" in entry and "h" in entry):
             shared.append((image, size))

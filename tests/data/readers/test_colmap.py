@@ -212,6 +212,17 @@ def nan_pose(scene):
             in_model("images.txt", lambda stored: stored.replace(b"1.png", b"\xff.png")),
             "is not a complete COLMAP model",
         ),
+        "a name of 5,000 digits": (
+            in_model("images.txt", lambda stored: stored.replace(b"1.png", b"1" * 5000 + b".png")),
+            r"(?s)2 of 12 .*1111\.png does not exist",
+        ),
+        "a number of 5,000 digits": (
+            in_model(
+                "images.txt",
+                lambda stored: stored.replace(b"images: 12", b"images: 1" + b"2" * 5000),
+            ),
+            "holds 12 entries and its header gives 12222",
+        ),
         "no points3D": (
             lambda scene: (scene / "sparse/0/points3D.txt").unlink(),
             r"not a complete COLMAP model.*points3D",

@@ -29,7 +29,20 @@ SECONDS = 5.0
 FEW = 24  # mutants of each kind in the fast test
 MANY = 1500
 ENDLESS = (os.mkfifo, lambda path: path.symlink_to("/dev/zero"))
-BYTES = (b"\x00", b"\xff" * 8, b"9" * 400, b"-1", b"nan", b"1e400", b"[" * 3000, b"\x80", b"", b'"')
+BYTES = (
+    b"\x00",
+    b"\xff" * 8,
+    b"9" * 400,
+    b"9" * 5000,
+    b"/",
+    b"-1",
+    b"nan",
+    b"1e400",
+    b"[" * 3000,
+    b"\x80",
+    b"",
+    b'"',
+)
 
 
 def mutate(stored: bytes, numbers: random.Random) -> bytes:

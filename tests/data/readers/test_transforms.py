@@ -88,6 +88,7 @@ def test_intrinsics_and_size_of_an_entry_win(scene):
     [
         (["b10", "b2", "b1", "b9"], ".png", [2, 1, 3, 0]),
         (["door", "arch", "wall", "roof"], ".jpg", [0, 1, 2, 3]),
+        (["9" * 240, "8" * 240, "10", "0" * 230 + "2"], ".png", [3, 2, 1, 0]),
     ],
 )
 def test_images_follow_their_numbers_if_all_have_one(scene, names, suffix, order):
@@ -169,6 +170,7 @@ BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
     "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), "has 1 usable"),
     "no path": (set_frame(file_path=None), r"frame 2 has no file_path"),
+    "the root": (set_frame(file_path="/"), r"frame 2 \(/\) has the file_path /: name its image"),
     "no pose": (set_frame(transform_matrix=None), r"frame 2 \(images/2\.png\).*not 4x4"),
     "ragged": (set_frame(transform_matrix=[[1, 2], [3]]), r"frame 2 .*not 4x4"),
     "nan": (set_frame(transform_matrix=(pose(0) * np.nan).tolist()), r"frame 2 .*NaN"),
