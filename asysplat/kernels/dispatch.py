@@ -1,6 +1,8 @@
 """The choice of an operator's backend, and checks of its inputs."""
 
+import os
 from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -13,6 +15,9 @@ from asysplat.errors import InputError
 from asysplat.kernels.self_check import are_kernels_right
 
 Implementation = TypeVar("Implementation")
+# A forked process lacks the OpenMP threads of its parent, for which torch would wait forever.
+os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
+
 KERNEL_BACKENDS = ("cpu", "cuda")  # the backends that run kernels; the others are written in torch
 
 

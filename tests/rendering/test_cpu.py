@@ -57,3 +57,34 @@ def test_a_forked_process_draws_too(make_scene):
     process.start()
     process.join(60)
     assert process.exitcode == 0 and queue.get()
+
+
+FORKED = """
+import multiprocessing, torch
+from asysplat import load
+from asysplat.data import ProceduralScene
+torch.set_num_threads(2)
+views, network = ProceduralScene(1, 64, 64, 8).views(range(4)), load(None)
+
+with torch.no_grad():
+    expected = network(views).means  # on two threads
+context = multiprocessing.get_context("fork")
+queue = context.SimpleQueue()
+def child():
+    gaussians = network(views)
+    gaussians.means.sum().backward()
+    queue.put((gaussians.means.detach() - expected).abs().max().item())
+process = context.Process(target=child, daemon=True)
+process.start()
+process.join(60)
+assert process.exitcode == 0, process.exitcode
+assert queue.get() < 1e-4
+"""
+
+
+@pytest.mark.medium
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_predicts_and_trains_too():
+    """Although torch's OpenMP threads stay behind, for which a child would wait forever."""
+    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, timeout=200)
+    assert done.returncode == 0, done.stderr.decode()
