@@ -87,6 +87,42 @@ def test_images_and_gradients_are_those_of_the_reference(make_scene, name):
     assert max(grads) <= 5e-6
 
 
+EXTREMES = {  # norm of the quaternions, smallest and largest scale
+    "tiny quaternions": (1e-30, 0.1, 1.0),
+    "huge quaternions": (1e25, 0.1, 1.0),
+    "dust beside mountains": (1.0, 1e-12, 1e8),
+    "dust beside orbits": (1.0, 1e-12, 1e12),
+}
+
+
+def extreme_errors(make_scene, name, extremes, device):
+    norm, smallest, largest = EXTREMES[extremes]
+    gaussians, cameras = make_batch(make_scene, count=40, height=33, width=40, device=device)
+    powers = torch.rand(gaussians.scales.shape, generator=torch.manual_seed(0)).to(device)
+    gaussians.scales.copy_(smallest * (largest / smallest) ** powers)
+    gaussians.quats.copy_(gaussians.quats / gaussians.quats.norm(dim=-1, keepdim=True) * norm)
+    settings, scene = RenderSettings(depth=None), (gaussians, cameras)
+    exact = run(reference.draw, *(part.to(torch.float64) for part in scene), settings)
+    assert exact[0][1].max() > 0.3
+    images, grads = errors(run(BACKENDS[name], *scene, settings), exact)
+    return max(images), max(grads)
+
+
+@pytest.mark.parametrize("extremes", EXTREMES)
+def test_extreme_numbers_are_as_exact_in_float32(make_scene, extremes):
+    image, grad = extreme_errors(make_scene, "cpu", extremes, "cpu")
+    assert image <= 1e-6 and grad <= 1e-5
+    image, grad = extreme_errors(make_scene, "reference", extremes, "cpu")
+    assert image <= 1e-5 and grad <= 1e-4
+
+
+@kernel
+@pytest.mark.parametrize("extremes", [*EXTREMES][:-1])  # its gradients are float32
+def test_extreme_numbers_are_as_exact_on_a_gpu(make_scene, extremes):
+    image, grad = extreme_errors(make_scene, "cuda", extremes, DEVICE)
+    assert image <= 1e-6 and grad <= 1e-5
+
+
 # The statistic that counts each kind of culling.
 GAINS = {
     "opacity": "culled_by_opacity",

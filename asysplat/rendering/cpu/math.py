@@ -48,14 +48,15 @@ sh_basis_gradient = inline(sh.sh_basis_gradient)
 @inline
 def triple(array, start):
     """Read three float64 from a flat array."""
-    return (float(array[start]), float(array[start + 1]), float(array[start + 2]))
+    # Numba's float() would leave them in float32.
+    return np.float64(array[start]), np.float64(array[start + 1]), np.float64(array[start + 2])
 
 
 @inline
 def unit_quaternion(quats, start):
     """Read a quaternion from a flat array; return its unit quaternion and 1 / its length."""
     w, x, y = triple(quats, start)
-    z = float(quats[start + 3])
+    z = np.float64(quats[start + 3])
     inverse = 1 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
@@ -102,7 +103,7 @@ def log2(x):
     """Compute log2 of a positive float64, which is first rounded to float32, to 1e-9."""
     bits = to_bits(np.float32(x))
     exponent = (bits >> np.int32(23)) - np.int32(127)
-    mantissa = float(from_bits((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000)))
+    mantissa = np.float64(from_bits((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000)))
     # Move the mantissa from [1, 2) to around 1.
     high = mantissa > SQRT_2
     mantissa = 0.5 * mantissa if high else mantissa

@@ -171,7 +171,7 @@ def _project_batch(count, batch, camera, frame, ellipses):
         mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
         xx, xy, yy, _, det0, det = covariance(mx, my, eps)
         a, b, c = whitening(xy, yy + eps, det)
-        opacity = float(opacities[i])
+        opacity = np.float64(opacities[i])
         if settings.antialiased:
             opacity *= compensation(det0, det, settings.compensation_min)
         x = tangents[0] * focal[0] + principal[0]
@@ -185,7 +185,7 @@ def _project_batch(count, batch, camera, frame, ellipses):
             (z > settings.near)
             & (z < MAX_MAGNITUDE)
             & (opacity >= alpha_min)
-            & (float(opacities[i]) <= 1)
+            & (np.float64(opacities[i]) <= 1)
             & (a > 0)
             & (abs(x + y + b + c) < np.inf)
         )
@@ -234,7 +234,7 @@ def _store_color(inputs, g, image, basis, splats, d):
     for channel in range(3):
         color = 0.5
         for k in range(count):
-            coefficient = float(sh[g, k, channel])
+            coefficient = np.float64(sh[g, k, channel])
             usable &= abs(coefficient) < MAX_MAGNITUDE
             color += basis[k] * coefficient
         splats[d, RED + channel] = max(color, 0.0)

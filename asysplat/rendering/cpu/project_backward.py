@@ -120,7 +120,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     _, xy, yy, _, det0, det = covariance(mx, my, eps)
 
     # Opacity, and antialiasing.
-    opacity = float(inputs.opacities[g])
+    opacity = np.float64(inputs.opacities[g])
     g_det0 = g_det = 0.0
     g_opacity = splat_grads[G_LOG_OPACITY] / opacity
     if settings.antialiased and det0 > settings.compensation_min * det:
@@ -155,13 +155,13 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     for channel in range(3):
         color = 0.5
         for k in range(count):
-            color += basis[k] * float(sh[g, k, channel])
+            color += basis[k] * np.float64(sh[g, k, channel])
         if color > 0:
             g_color = splat_grads[G_RED + channel]
             for k in range(count):
                 if needs[0]:
                     sums[SH + 3 * k + channel] += basis[k] * g_color
-                g_basis[k] += float(sh[g, k, channel]) * g_color
+                g_basis[k] += np.float64(sh[g, k, channel]) * g_color
     g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_basis)
     g_offset = plus(g_offset, 1 / length, g_direction)
     if square > MIN_SQUARED_DISTANCE:

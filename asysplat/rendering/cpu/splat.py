@@ -131,12 +131,12 @@ def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
     bases[d, BASE_X], bases[d, BASE_Y] = np.int32(base_x), np.int32(base_y)
     splats[d, X], splats[d, Y] = x - base_x, y - base_y
     splats[d, A], splats[d, B] = a, b
-    splats[d, A_REST] = a - float(np.float32(a))
-    splats[d, B_REST] = b - float(np.float32(b))
+    splats[d, A_REST] = a - np.float64(np.float32(a))
+    splats[d, B_REST] = b - np.float64(np.float32(b))
     splats[d, C] = c
     splats[d, LOG_OPACITY] = log_opacity
     splats[d, DEPTH] = z
-    splats[d, DEPTH_REST] = z - float(np.float32(z))
+    splats[d, DEPTH_REST] = z - np.float64(np.float32(z))
     splats[d, EXTENT_Y] = min(extent_y * (1 + 1e-6), MAX_CENTER_OFFSET)
 
 
@@ -144,12 +144,12 @@ def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
 def load_ellipse(splats, bases, d):
     """Read the ellipse of splat d."""
     return Ellipse(
-        x=float(bases[d, BASE_X]) + float(splats[d, X]),
-        y=float(bases[d, BASE_Y]) + float(splats[d, Y]),
-        a=float(splats[d, A]) + float(splats[d, A_REST]),
-        b=float(splats[d, B]) + float(splats[d, B_REST]),
-        c=float(splats[d, C]),
-        extent_y=float(splats[d, EXTENT_Y]),
+        x=np.float64(bases[d, BASE_X]) + np.float64(splats[d, X]),
+        y=np.float64(bases[d, BASE_Y]) + np.float64(splats[d, Y]),
+        a=np.float64(splats[d, A]) + np.float64(splats[d, A_REST]),
+        b=np.float64(splats[d, B]) + np.float64(splats[d, B_REST]),
+        c=np.float64(splats[d, C]),
+        extent_y=np.float64(splats[d, EXTENT_Y]),
     )
 
 
@@ -165,10 +165,10 @@ def tile_window(tile, frame):
 @inline
 def load_splat(splats, bases, d, window):
     """Read splat d relative to a tile."""
-    x = window.left + float(MIDDLE + HALF) - float(bases[d, BASE_X]) - float(splats[d, X])
-    y = window.top + float(HALF) - float(bases[d, BASE_Y]) - float(splats[d, Y])
-    a = float(splats[d, A]) + float(splats[d, A_REST])
-    b = float(splats[d, B]) + float(splats[d, B_REST])
+    x = window.left + float(MIDDLE + HALF) - np.float64(bases[d, BASE_X]) - np.float64(splats[d, X])
+    y = window.top + float(HALF) - np.float64(bases[d, BASE_Y]) - np.float64(splats[d, Y])
+    a = np.float64(splats[d, A]) + np.float64(splats[d, A_REST])
+    b = np.float64(splats[d, B]) + np.float64(splats[d, B_REST])
     return TileSplat(
         x=x,
         y=y,
@@ -191,7 +191,7 @@ def visible_rows(splats, d, y, rows):
 
     y leads from the splat's center to the first row, as in `TileSplat`.
     """
-    extent = float(splats[d, EXTENT_Y]) + PIXEL_MARGIN
+    extent = np.float64(splats[d, EXTENT_Y]) + PIXEL_MARGIN
     first = math.ceil(max(-y - extent, 0.0))
     last = math.floor(min(-y + extent, rows - 1.0))
     return first, last

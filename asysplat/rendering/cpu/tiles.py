@@ -11,7 +11,7 @@ import numpy as np
 
 from asysplat.kernels.simd.threads import inline, kernel
 from asysplat.rendering.cpu.splat import DEPTH, DEPTH_REST, TILE
-from asysplat.rendering.formulas import PIXEL_MARGIN
+from asysplat.rendering.formulas import MAX_CENTER_OFFSET, PIXEL_MARGIN
 
 INSERTION_SORT_LENGTH = 32  # lists up to this are sorted by insertion
 RADIX = 256
@@ -88,8 +88,9 @@ def list_tiles(ellipse, box, frame, histogram, tiles, start):
     Return their number, at most that of its box.
     """
     first_row, last_row, left, right = box[0], box[1], box[2], box[3]
-    # The ellipse touches every tile of a box of one row or one column.
+    # The ellipse touches every tile of a box of one row or one column; an extent may be cut short.
     exact = frame.project.cull_ellipse and right > left and last_row > first_row
+    exact = exact and ellipse.extent_y < MAX_CENTER_OFFSET
     count = 0
     for row in range(first_row, last_row + 1):
         first, last = left, right

@@ -12,7 +12,7 @@ from torch import Tensor
 from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.math import clamp
-from asysplat.rendering.cuda.splat import TILE, load_ellipse
+from asysplat.rendering.cuda.splat import MAX_CENTER_OFFSET, TILE, load_ellipse
 
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
 ROUNDING = tl.constexpr(1e-6)  # of float32, relative; an ellipse is widened by it
@@ -143,7 +143,9 @@ def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
     left_half = flatness * half_chord(extent, left_dy)
     right, left = right_half - slope * right_dy, -left_half - slope * left_dy
     margin = tl.maximum(right_half, left_half) + tl.abs(slope) * extent
-    return tile_range(base_x, x + left, x + right, PIXEL_MARGIN + ROUNDING * margin, width)
+    span = tile_range(base_x, x + left, x + right, PIXEL_MARGIN + ROUNDING * margin, width)
+    box, whole = box_columns(ellipse, width), extent < MAX_CENTER_OFFSET  # else it is cut short
+    return tl.where(whole, span[0], box[0]), tl.where(whole, span[1], box[1])
 
 
 @kernel
