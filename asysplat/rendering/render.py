@@ -83,9 +83,9 @@ def render(
 
     Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a culled
     Gaussian (see `reference.project.project`) has gradient 0. Half-precision inputs are computed in
-    float32, also under autocast. Errors of float32 stay at 1e-6 for quaternions of any length, and for
-    scales from 1e-12 to 1e8 in one scene. The same inputs give the same bits on one device, and on a CPU
-    with any number of threads.
+    float32, also under autocast. The kernels' errors stay near 1e-6 for quaternions of any length,
+    and for scales from 1e-12 to 1e8 in one scene. The same inputs give the same bits on one device,
+    and on a CPU with any number of threads.
 
     Args:
         gaussians: [..., N].
