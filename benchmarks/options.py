@@ -14,7 +14,7 @@ import torch
 from asysplat.doctor import processor
 from asysplat.errors import InputError
 
-NAMES = ("render", "ops", "model", "data", "formats", "pareto", "bench", "device")
+NAMES = ("render", "ops", "model", "data", "formats", "pareto", "systems", "bench", "device")
 SUITES = {name: f"benchmarks.{name}" for name in NAMES}
 SUITES |= {name: f"benchmarks.{name}.report" for name in ("stability", "machine_code")}
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}

@@ -258,13 +258,14 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
 
 
 def find_scenes(
-    names: Sequence[str], folder: Path
+    names: Sequence[str], folder: Path, option: str = "pareto.scenes"
 ) -> tuple[dict[str, Callable[[int, int, int], Photographs]], dict[str, str]]:
     """Find scenes by name.
 
     Args:
         names: names of PROCEDURAL, of REAL, or of folders in `folder`.
         folder: folder of the real scenes.
+        option: name of the option that names them.
 
     Returns:
         Functions that open the scenes, and the reasons why other scenes are absent, both by name.
@@ -275,7 +276,7 @@ def find_scenes(
         InputError: a name is unknown, or every scene is absent.
     """
     present = sorted(path.name for path in folder.glob("*") if path.is_dir())
-    check_names("pareto.scenes", names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
+    check_names(option, names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
     scenes, absent = {}, {}
     for name in names:
         if name in PROCEDURAL:
@@ -286,7 +287,7 @@ def find_scenes(
             absent[name] = f"{folder / name} is no folder"
     if not scenes:
         raise InputError(
-            f"pareto.scenes={list(names)}: none is a folder of {folder}; set ASYSPLAT_SHARED to "
+            f"{option}={list(names)}: none is a folder of {folder}; set ASYSPLAT_SHARED to "
             f"the folder that holds data/, or take of {', '.join(PROCEDURAL)}."
         )
     return scenes, absent

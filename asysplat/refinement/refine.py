@@ -38,7 +38,7 @@ class RefinementProgress:
 
     step: int  # steps so far
     fraction: float  # fraction of the refinement that is done, in [0, 1]
-    seconds: float  # since its start
+    seconds: float  # of its steps so far, without what watches it
     psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
 
@@ -273,11 +273,12 @@ def run_steps(
     """Advance a refinement to the end of its budget, or for `max_steps`; see `refine`."""
     errors: deque[float] = deque(maxlen=refinement.views.num_views)
     step, progress = 0, 0.0
-    clock = time.perf_counter()
+    passed = 0.0
     while progress < 1:
+        clock = time.perf_counter()
         errors.append(refinement.advance(progress))
+        passed += time.perf_counter() - clock
         step += 1
-        passed = time.perf_counter() - clock
         used = (passed if budget.timed else step) / budget.amount
         progress = min(1.0, max(used, step / max_steps))
         psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))

@@ -1,0 +1,260 @@
+"""Quality over seconds: one pass of a network, and refinements as ours and others schedule them.
+
+Every system gets the same photographs and is measured on the same held-out ones. A refinement is
+measured on its way; its clock stands still meanwhile.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+
+import matplotlib
+import torch
+from hydra.utils import instantiate
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from asysplat import load
+from asysplat.data.photographs import Photographs
+from asysplat.errors import InputError
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.refinement import (
+    PUBLISHED_3DGS,
+    Refinement,
+    RefinementProgress,
+    RefinementSettings,
+    ScaffoldSettings,
+    refine,
+    refine_scaffold,
+)
+from asysplat.refinement.init import initial_gaussians
+from asysplat.rendering import render
+from asysplat.report.style import FAINT, OURS, PAPER, STYLE
+from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
+from benchmarks.options import check_names
+from benchmarks.pareto import NOISE_OF_SECONDS, FeedForward, find_scenes
+from benchmarks.table import Columns, machine_note, make_table, number_column, text_column
+from benchmarks.timing import Result
+
+PUBLISHED_STEPS = 30_000  # of 3DGS and Scaffold-GS
+SPEEDS = ("fast", "balanced", "exact")  # of the network, see conf/speed
+NETWORK = "AsySplat, one pass"
+TRACKED = TrackedMetrics(
+    names=("scene", "system", "mark"),
+    must_match=("photographs", "limit"),
+    kinds={"psnr": DECIBELS, "lpips": LPIPS_DISTANCE},
+)
+NOTES = """\
+mark: seconds after which a refinement is measured, or the network's speed=; s: those it took
+start: what the Gaussians are placed by: points of the files where a scene has them
+cut: the published 30,000 steps, ended by the time limit; else the schedule takes all the time"""
+
+
+@dataclass(frozen=True)
+class RefinedSystem:
+    """A refinement: its start, its settings, and whether its published schedule is cut."""
+
+    start: (
+        str | None
+    )  # see `initial_gaussians`; None: points, or a plane sweep where there are none
+    settings: RefinementSettings | ScaffoldSettings
+    cut: bool = False
+
+
+CURVES = {
+    "AsySplat, refined": RefinedSystem("network", RefinementSettings()),
+    "plane sweep, refined": RefinedSystem("plane_sweep", RefinementSettings()),
+    "3DGS": RefinedSystem(None, PUBLISHED_3DGS),
+    "3DGS, cut": RefinedSystem(None, PUBLISHED_3DGS, cut=True),
+    "Scaffold-GS": RefinedSystem(None, ScaffoldSettings()),
+    "Scaffold-GS, cut": RefinedSystem(None, ScaffoldSettings(), cut=True),
+}
+COLORS = {NETWORK: OURS, "AsySplat, refined": OURS, "plane sweep, refined": "#101112"}
+COLORS |= {"3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}
+Measure = Callable[[Tensor], dict[str, float]]
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Measure every system of `options.systems` on every scene.
+
+    Returns:
+        "rows": one for each scene, system and mark: seconds, steps and Gaussians, the metrics of
+        the held-out views. "not_measured": the reason for what was not measured.
+
+    Raises:
+        InputError: a scene or a system is unknown; marks that are not above 0 and increasing.
+    """
+    config = OmegaConf.to_container(options.systems, resolve=True)
+    marks, shared = config["marks"], Path(config["shared"])
+    increasing = all(a < b for a, b in zip([0, *marks], marks, strict=False))
+    if not marks or not increasing:
+        raise InputError(f"systems.marks={marks}: give increasing seconds above 0.")
+    names = [NETWORK, *CURVES] if config["names"] == "all" else config["names"]
+    check_names("systems.names", names, [NETWORK, *CURVES, "all"])
+    scenes, absent = find_scenes(config["scenes"], shared / "data", "systems.scenes")
+    protocol = instantiate(options.metrics)
+    lpips = load_lpips(protocol.lpips_net, shared / "weights")
+    if lpips is None:
+        absent["LPIPS"] = f"{shared / 'weights'} has no weights of its backbone"
+    rows: list[Result] = []
+    for scene_name, open_scene in scenes.items():
+        photographs = open_scene(**config["photographs"])
+        targets = photographs.held_out
+
+        def quality(images: Tensor) -> dict[str, float]:
+            metrics = protocol.image_metrics(images, targets, lpips)  # noqa: B023, called at once
+            return {metric: values.mean().item() for metric, values in metrics.items()}
+
+        where = {"scene": scene_name, "photographs": config["photographs"], "limit": marks[-1]}
+        for name in track(names, scene_name, console=console, transient=True):
+            if name == NETWORK:
+                found = measure_network(photographs, quality)
+            else:
+                found = measure_refinement(photographs, CURVES[name], marks, quality)
+            rows += [where | {"system": name} | row for row in found]
+        console.print(f"{scene_name}: {len(names)} systems", highlight=False)
+    return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}
+
+
+@torch.no_grad()
+def measure_network(photographs: Photographs, quality: Measure) -> list[Result]:
+    """Measure one pass of the shipped network at each speed, after one to warm up."""
+    rows = []
+    side = min(128, photographs.inputs.cameras.height)
+    for speed in SPEEDS:
+        setting = FeedForward(
+            views=photographs.inputs.num_views, side=side, overrides=[f"speed={speed}"]
+        )
+        run = setting.prepare(OmegaConf.create(), photographs.inputs.images.device)
+        run(photographs)
+        clock = time.perf_counter()
+        rendered = run(photographs)
+        seconds = time.perf_counter() - clock
+        row = {"mark": speed, "seconds": seconds, "steps": None, "start": "network"}
+        row |= {"gaussians": rendered.num_gaussians}
+        rows.append(row | quality(rendered.images))
+    return rows
+
+
+def measure_refinement(
+    photographs: Photographs, curve: RefinedSystem, marks: Sequence[float], quality: Measure
+) -> list[Result]:
+    """Measure a refinement after each mark, in seconds."""
+    settings, inputs, cameras = curve.settings, photographs.inputs, photographs.held_out.cameras
+    start = curve.start or ("plane_sweep" if photographs.points is None else "points")
+    network = load("shipped") if start == "network" else None
+    clock = time.perf_counter()
+    gaussians = initial_gaussians(start, photographs, settings, network)
+    before = time.perf_counter() - clock
+    background, rows, due = inputs.mean_color(), [], list(marks)
+
+    def watch(progress: RefinementProgress, refinement) -> bool:
+        if progress.seconds >= due[0] or progress.fraction == 1:
+            with torch.no_grad():
+                if isinstance(refinement, Refinement):
+                    image = render(refinement.gaussians, cameras, background, depth=False).image
+                else:
+                    image = refinement.scene.render(cameras, background, depth=False).image
+            row = {"mark": due.pop(0), "seconds": before + progress.seconds}
+            row |= {"steps": progress.step, "gaussians": progress.gaussians, "start": start}
+            rows.append(row | {"noise": NOISE_OF_SECONDS} | quality(image))
+        return not due
+
+    function = refine_scaffold if isinstance(settings, ScaffoldSettings) else refine
+    run = partial(function, gaussians, inputs, settings, background=background)
+    if curve.cut:
+        run(seconds=1e-3)  # compiles the kernels
+    run(watch=watch, **({"steps": PUBLISHED_STEPS} if curve.cut else {"seconds": marks[-1]}))
+    return rows
+
+
+def average(rows: Sequence[Result]) -> list[Result]:
+    """Average each system and mark over the scenes."""
+    groups: dict[tuple, list[Result]] = {}
+    for row in rows:
+        groups.setdefault((row["system"], row["mark"]), []).append(row)
+    means = []
+    for (system, mark), group in groups.items():
+        numbers = ("seconds", "gaussians", "psnr", "ssim", "lpips")
+        mean = {
+            name: fmean(row[name] for row in group)
+            for name in numbers
+            if all(row.get(name) is not None for row in group)
+        }
+        means.append({"system": system, "mark": mark, "scenes": len(group)} | mean)
+    return means
+
+
+def tables(results: Result) -> list[Table]:
+    """Show every system on every scene, then the means over scenes."""
+    absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
+    notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
+    names = dict.fromkeys(row["scene"] for row in results["rows"])
+    shown = [
+        make_table(name, ROWS, [row for row in results["rows"] if row["scene"] == name])
+        for name in names
+    ]
+    return [*shown, make_table("means over scenes", MEANS, average(results["rows"]), notes)]
+
+
+def plot(results: Result) -> Figure:
+    """Plot mean PSNR and LPIPS of each system against mean seconds."""
+    rows = average(results["rows"])
+    metrics = {"psnr": "PSNR of held-out photographs, dB", "lpips": "LPIPS, lower is better"}
+    metrics = {name: title for name, title in metrics.items() if all(name in row for row in rows)}
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(1.0 + 5.4 * len(metrics), 5.0), layout="constrained")
+        grid = figure.subplots(1, len(metrics), squeeze=False)[0]
+        for axes, (metric, title) in zip(grid, metrics.items(), strict=True):
+            for system in dict.fromkeys(row["system"] for row in rows):
+                points = [(r["seconds"], r[metric]) for r in rows if r["system"] == system]
+                style = "--" if system.endswith(", cut") else "-"
+                color = COLORS[system.removesuffix(", cut")]
+                marker = "s" if system == NETWORK else "o"
+                axes.plot(
+                    *zip(*points, strict=True),
+                    style,
+                    color=color,
+                    marker=marker,
+                    ms=4,
+                    label=system,
+                )
+            axes.set(title=title, xlabel="seconds", xscale="log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        grid[0].legend(frameon=False, fontsize=9)
+        scenes = dict.fromkeys(row["scene"] for row in results["rows"])
+        figure.supxlabel(f"mean over {', '.join(scenes)}", fontsize=9, color=FAINT)
+    return figure
+
+
+ROWS: Columns = {
+    "system": text_column("{system}"),
+    "mark": text_column("{mark}"),
+    "s": number_column("seconds", "{:.1f}"),
+    "steps": number_column("steps", "{:,}"),
+    "start": text_column("{start}"),
+    "Gaussians": number_column("gaussians", "{:,}"),
+    "PSNR": number_column("psnr", "{:.2f}"),
+    "SSIM": number_column("ssim", "{:.3f}"),
+    "LPIPS": number_column("lpips", "{:.3f}"),
+}
+MEANS: Columns = {
+    "system": text_column("{system}"),
+    "mark": text_column("{mark}"),
+    "scenes": text_column("{scenes}"),
+    "s": number_column("seconds", "{:.1f}"),
+    "Gaussians": number_column("gaussians", "{:,.0f}"),
+    "PSNR": number_column("psnr", "{:.2f}"),
+    "SSIM": number_column("ssim", "{:.3f}"),
+    "LPIPS": number_column("lpips", "{:.3f}"),
+}
