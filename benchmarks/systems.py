@@ -157,15 +157,18 @@ def measure_refinement(
     background, rows, due = inputs.mean_color(), [], list(marks)
 
     def watch(progress: RefinementProgress, refinement) -> bool:
-        if progress.seconds >= due[0] or progress.fraction == 1:
+        ended = progress.fraction == 1  # maybe before the last mark
+        reached = [mark for mark in due if ended or progress.seconds >= mark]
+        if reached:
             with torch.no_grad():
                 if isinstance(refinement, Refinement):
                     image = render(refinement.gaussians, cameras, background, depth=False).image
                 else:
                     image = refinement.scene.render(cameras, background, depth=False).image
-            row = {"mark": due.pop(0), "seconds": before + progress.seconds}
-            row |= {"steps": progress.step, "gaussians": progress.gaussians, "start": start}
-            rows.append(row | {"noise": NOISE_OF_SECONDS} | quality(image))
+            row = {"seconds": before + progress.seconds, "steps": progress.step, "start": start}
+            row |= {"gaussians": progress.gaussians, "noise": NOISE_OF_SECONDS} | quality(image)
+            rows.extend({"mark": mark} | row for mark in reached)
+            del due[: len(reached)]
         return not due
 
     function = refine_scaffold if isinstance(settings, ScaffoldSettings) else refine

@@ -48,7 +48,6 @@ def test_every_system_has_a_row_for_each_mark(results):
         )
         for row in rows:
             assert row["psnr"] > 10 and row["gaussians"] > 0
-            assert name == NETWORK or row["seconds"] >= row["mark"]
 
 
 @pytest.mark.medium
