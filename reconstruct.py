@@ -36,12 +36,7 @@ from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import find_views
-from asysplat.refinement import (
-    RefinementSettings,
-    ScaffoldSettings,
-    refine,
-    refine_scaffold,
-)
+from asysplat.refinement import RefinementSettings, ScaffoldSettings, refine, refine_scaffold
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
 from asysplat.runs.device import find_device

@@ -63,6 +63,11 @@ def make_folder(path: Path, option: str) -> None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
 
 
+def has_file(path: Path) -> bool:
+    """Return whether a file exists; False for a name that is too long for any."""
+    return os.path.isfile(path)  # Path.is_file raises OSError
+
+
 def check_regular(path: str | Path) -> None:
     """Check that a path is no pipe or device, which may have no end.
 

@@ -62,9 +62,7 @@ cut: the published 30,000 steps, ended by the time limit; else the schedule take
 class RefinedSystem:
     """A refinement: its start, its settings, and whether its published schedule is cut."""
 
-    start: (
-        str | None
-    )  # see `initial_gaussians`; None: points, or a plane sweep where there are none
+    start: str | None  # see `initial_gaussians`; None: points, else a plane sweep
     settings: RefinementSettings | ScaffoldSettings
     cut: bool = False
 

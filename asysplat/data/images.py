@@ -7,7 +7,6 @@ functions that read raise an InputError for a file that is missing, empty, damag
 
 import hashlib
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -24,6 +23,7 @@ from PIL import Image
 from PIL.ImageFile import ImageFile as OpenedImage
 
 from asysplat.errors import InputError
+from asysplat.files import has_file
 
 HEIF = (".heic", ".heif")  # suffixes of what phones save
 # Pillow goes by the content and knows more, some of which start other programs (EPS).
@@ -321,7 +321,7 @@ def _register_heif() -> bool:
 
 
 def _check_exists(path: Path) -> None:
-    if not os.path.isfile(path):
+    if not has_file(path):
         raise InputError(f"{path} does not exist: put the image there, or leave it out.")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes): copy it again, or leave it out.")

@@ -6,7 +6,7 @@ The paper's post-optimization is the setting `PAPER`.
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
@@ -26,7 +26,7 @@ from asysplat.refinement.densification.relocate import McmcDensifier
 from asysplat.refinement.densification.spawn import ErrorDensifier
 from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
 from asysplat.refinement.isotropic import footprints
-from asysplat.refinement.sampling import random_permutation
+from asysplat.refinement.sampling import random_order
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
@@ -38,7 +38,7 @@ class RefinementProgress:
 
     step: int  # steps so far
     fraction: float  # fraction of the refinement that is done, in [0, 1]
-    seconds: float  # of its steps so far, without what watches it
+    seconds: float  # seconds of its steps so far, without what watches it
     psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
 
@@ -92,7 +92,7 @@ class Refinement:
         self.corrections = Corrections(views.num_views, settings.rates, views.images.device)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
-        self._view_order = self._random_order()
+        self._view_order = random_order(views.num_views, self._generator)
         self._steps = self._rounds = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
@@ -197,11 +197,6 @@ class Refinement:
 
     def _views(self, progress: float) -> Views:
         return self._half_views if progress < self.settings.half_resolution_until else self.views
-
-    def _random_order(self) -> Iterator[int]:
-        """Yield views in a random order; all are used before one is used again."""
-        while True:
-            yield from random_permutation(self.views.num_views, self._generator).tolist()
 
     def _units(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         if self.settings.rates.unit == "scene":

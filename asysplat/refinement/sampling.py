@@ -1,5 +1,7 @@
 """Random numbers on the device of their generator."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -8,6 +10,12 @@ from torch import Tensor
 def random_permutation(count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
     """Sample a permutation on the generator's device."""
     return torch.randperm(count, generator=generator, device=generator.device)
+
+
+def random_order(count: int, generator: torch.Generator) -> Iterator[int]:
+    """Yield indices in a random order, without end; all are used before one is used again."""
+    while True:
+        yield from random_permutation(count, generator).tolist()
 
 
 def random_normal(

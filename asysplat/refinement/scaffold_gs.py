@@ -5,7 +5,7 @@ constants of its code (city-super/Scaffold-GS, without appearance codes).
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,7 @@ from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.densification.clone_split import screen_gradients
 from asysplat.refinement.fields import Parameters
 from asysplat.refinement.refine import RefinementProgress, read_budget, run_steps
-from asysplat.refinement.sampling import random_permutation
+from asysplat.refinement.sampling import random_order
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -275,7 +275,7 @@ class ScaffoldRefinement:
         )
         self._generator = torch.Generator(views.images.device).manual_seed(seed)
         self._statistics = AnchorStatistics(self.scene.anchors, len(self.scene.anchors))
-        self._view_order, self._steps = self._random_order(), 0
+        self._view_order, self._steps = random_order(views.num_views, self._generator), 0
 
     @property
     def num_gaussians(self) -> int:
@@ -341,10 +341,6 @@ class ScaffoldRefinement:
         scene.keep(rows)
         statistics.keep(rows)
 
-    def _random_order(self) -> Iterator[int]:
-        while True:
-            yield from random_permutation(self.views.num_views, self._generator).tolist()
-
 
 def refine_scaffold(
     gaussians: Gaussians,
@@ -365,7 +361,7 @@ def refine_scaffold(
 
     Args:
         gaussians, views, background, seed, watch: see `asysplat.refinement.refine`.
-        settings: of the cells and of growth.
+        settings: settings of the cells and of growth.
         seconds, steps: give one of them.
 
     Raises:

@@ -228,7 +228,7 @@ def test_anchors_grow_by_the_gradient_at_each_level_and_transparent_ones_go(smal
     assert (scene.anchors == kept).all(1).any()
     for values in vars(statistics).values():
         assert len(values) == len(scene.anchors)
-    assert statistics.seen.sum() == 8  # of the anchor that was not seen often enough
+    assert statistics.seen.sum() == 8  # the anchor that was not seen often enough
     assert statistics.shown.sum() == 4 * OFFSETS
     assert scene.optimizer.num_rows == len(scene.anchors)
 

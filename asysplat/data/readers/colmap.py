@@ -22,6 +22,7 @@ from asysplat.data.readers.colmap_model import read_model
 from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import has_file
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
@@ -123,9 +124,7 @@ def _lens(camera: pycolmap.Camera, where: str) -> Lens:
 
 
 def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
-    counts = {
-        folder: sum(common.has_file(scene / folder / name) for name in names) for folder in FOLDERS
-    }
+    counts = {folder: sum(has_file(scene / folder / name) for name in names) for folder in FOLDERS}
     best = max(counts, key=lambda folder: counts[folder])
     if counts[best] == 0:
         named = f"names {len(names)} images, such as {names[0]}" if names else "registers no image"

@@ -55,11 +55,6 @@ def natural_order(path: Path) -> list[str | tuple[int, str]]:
     return keys
 
 
-def has_file(path: Path) -> bool:
-    """Return whether a file exists, also for a name that is too long to be one."""
-    return os.path.isfile(path)
-
-
 def read_text(file: Path) -> str:
     """Read UTF-8 text, with or without a byte order mark."""
     return file.read_text(encoding="utf-8-sig", errors="replace")

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import has_alpha
-from asysplat.data.readers.common import check_map_size, has_file
+from asysplat.data.readers.common import check_map_size
 from asysplat.data.sequence import PosedImage, PosedScene
+from asysplat.files import has_file
 
 FOLDER = "masks"
 

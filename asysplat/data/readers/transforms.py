@@ -23,6 +23,7 @@ from asysplat.data.readers.common import number
 from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import has_file
 from asysplat.scene import Cameras
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # read as OPENCV
@@ -75,10 +76,8 @@ def read_images(
         if not image.name:
             raise InputError(f"{where} has the file_path {image}: name its image.")
         # The path may lack the file's extension.
-        names = (image.name + suffix for suffix in ("", ".png", ".jpg"))
-        image = next(
-            (path for name in names if common.has_file(path := image.with_name(name))), image
-        )
+        paths = [image.with_name(image.name + suffix) for suffix in ("", ".png", ".jpg")]
+        image = next(filter(has_file, paths), image)
         size = image_size(image)
         if not ("w" in entry and "h" in entry):
             shared.append((image, size))
