@@ -30,7 +30,7 @@ from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement import AnchorScene, RefinementProgress
 from asysplat.rendering import Rendering, render
-from asysplat.runs.runs import SCENE
+from asysplat.runs.runs import PICTURE, SCENE
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.terminal import print_table
@@ -125,7 +125,7 @@ class Results:
             self.save_scene(scene)
         self._save_cameras()
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
-        self._save_contact_sheet("contact.png", scene)
+        self._save_contact_sheet(PICTURE, scene)
         self._save_metrics(scene, progress)
 
     def save_video(self, scene: Gaussians | AnchorScene) -> None:
@@ -141,7 +141,7 @@ class Results:
         if any(photographs.origin) and self._suffixes:
             offset = " ".join(map(repr, photographs.origin))
             print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
-        print(f"figure: {self.folder / 'contact.png'}")
+        print(f"figure: {self.folder / PICTURE}")
         if self._has_video:
             print(f"video: {self.folder / 'path.mp4'}")
         files = [self.folder / f"scene{suffix}" for suffix in self._suffixes]

@@ -9,12 +9,10 @@ from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
 from asysplat.runs.run_config import flat_options, read_config
-from asysplat.runs.runs import RESULTS
+from asysplat.runs.runs import RECONSTRUCTION, RESULTS
 from asysplat.runs.summary import RECONSTRUCTION_ROWS
 
 CONFIG = "config.yaml"
-PICTURE = "contact.png"
-MARKS = {"start.png", PICTURE, "scene.safetensors"}  # a folder with one of them is a run's
 MAX_BYTES = 2**20  # of metrics.json, which has 2 KB
 MAX_NUMBER = 1e12  # in metrics.json
 MAX_TEXT = 60  # characters of a value
@@ -41,7 +39,7 @@ def read_reconstructions(folder: Path) -> tuple[list[Reconstruction], list[str]]
     """
     runs, left_out = [], []
     for place, _, files in os.walk(folder):  # goes through no link
-        if MARKS.isdisjoint(files):
+        if not set(RECONSTRUCTION) & set(files):
             continue
         try:
             runs.append(_read_run(Path(place)))

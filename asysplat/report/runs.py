@@ -20,7 +20,6 @@ from asysplat.files import atomic_write, make_folder
 from asysplat.report.html import TEMPLATES
 from asysplat.report.reconstructions import (
     COUNTS,
-    PICTURE,
     SHOWN,
     Reconstruction,
     cut,
@@ -30,6 +29,7 @@ from asysplat.report.reconstructions import (
 from asysplat.report.table import Cell, Grid, Heading
 from asysplat.report.terminal import print_grid
 from asysplat.root import typed
+from asysplat.runs.runs import PICTURE
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -24,7 +24,9 @@ from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
 
 RESULTS = "metrics.json"
-SCENE = "scene.safetensors"  # in the folder of a reconstruction, from which run= goes on
+PICTURE = "contact.png"  # in the folder of a reconstruction
+SCENE = "scene.safetensors"  # there, too; run= goes on from it
+RECONSTRUCTION = ("start.png", PICTURE, SCENE)  # a folder with one of them is a reconstruction's
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # Names, paths, callbacks, keys that are only interpolated into others, and keys that only split the
 # batch.
@@ -170,7 +172,7 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 def find_runs(logs: Path) -> Iterator[Run]:
     """Yield every finished run below `logs`, oldest first; warn of results that are damaged."""
     for path in files_below(logs, RESULTS):
-        if _is_reconstruction(path.parent):
+        if any((path.parent / name).exists() for name in RECONSTRUCTION):
             continue
         try:
             results = json.loads(path.read_text())
@@ -188,18 +190,17 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 
 def find_reconstructions(logs: Path) -> list[Path]:
-    """Return the folders of the finished reconstructions below `logs`, oldest first."""
+    """Return the folders of the finished reconstructions below `logs` that left a scene.
+
+    Oldest first.
+    """
     folders = (path.parent for path in files_below(logs, RESULTS))
-    return [folder for folder in folders if _is_reconstruction(folder)]
+    return [folder for folder in folders if (folder / SCENE).exists()]
 
 
 def files_below(folder: Path, name: str) -> list[Path]:
     """Return the files of a name below a folder, oldest first."""
     return sorted(folder.rglob(name), key=lambda path: (path.stat().st_mtime, path))
-
-
-def _is_reconstruction(folder: Path) -> bool:
-    return (folder / SCENE).exists()
 
 
 def folder_of(

@@ -73,7 +73,9 @@ def test_errors_are_those_of_image_and_gradients():
 
 
 def test_mistakes_are_named(run_script, tmp_path):
-    known = "render, ops, model, data, formats, pareto, systems, bench, device, stability, machine_code"
+    known = (
+        "render, ops, model, data, formats, pareto, systems, bench, device, stability, machine_code"
+    )
     with pytest.raises(InputError, match=rf"^suite=rendr is unknown: choose from {known}\.$"):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):

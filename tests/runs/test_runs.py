@@ -7,9 +7,26 @@ import pytest
 
 from asysplat.runs import revision as revisions
 from asysplat.runs.evaluation_target import find_target
-from asysplat.runs.runs import config_hash, data_of, describe_run, find_run, find_runs
+from asysplat.runs.runs import (
+    RECONSTRUCTION,
+    config_hash,
+    data_of,
+    describe_run,
+    find_reconstructions,
+    find_run,
+    find_runs,
+)
 
 DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
+
+
+def test_a_reconstruction_with_or_without_a_scene_is_no_trained_run(tmp_path, recwarn):
+    for name, files in {"a": RECONSTRUCTION, "b": RECONSTRUCTION[:2]}.items():
+        (tmp_path / name).mkdir()
+        for file in ("metrics.json", *files):
+            (tmp_path / name / file).write_text("{}")
+    assert list(find_runs(tmp_path)) == [] and not recwarn.list
+    assert find_reconstructions(tmp_path) == [tmp_path / "a"]  # from whose scene run=last goes on
 
 
 @pytest.fixture
