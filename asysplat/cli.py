@@ -113,14 +113,27 @@ def error_message(error: BaseException) -> str | None:
                 f"a process that loads data was lost ({cause}); if memory was short, set "
                 "data.num_workers lower."
             )
-        if isinstance(cause, MemoryError) or type(cause).__name__ == "OutOfMemoryError":  # torch's
-            reason = str(cause).partition(". GPU")[0] or "no reason given"
+        if _is_out_of_memory(cause):
+            # Without torch's line of source before, and the state of its memory after.
+            reason = str(cause).rpartition("DefaultCPUAllocator: ")[2]
+            reason = re.split(r"\. (?:GPU|Error code)", reason)[0]
             return (
-                f"there is no memory left ({reason}): choose fewer or smaller views, fewer "
-                "Gaussians or a smaller batch; docs/options.md names the options."
+                f"there is no memory left ({reason or 'no reason given'}): choose fewer or smaller "
+                "views, fewer Gaussians or a smaller batch; docs/options.md names the options."
             )
         cause = cause_of(cause)
     return None
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error is Python's, the system's or torch's for too little memory."""
+    # By name: torch may not be loaded. Its CPU allocator and Python's threads raise RuntimeError.
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    words = ("DefaultCPUAllocator: can't allocate memory", "can't start new thread")
+    return isinstance(error, RuntimeError) and any(word in str(error) for word in words)
 
 
 def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 
 import pytest
 import torch
@@ -23,6 +24,8 @@ SENTENCES = {
         "no memory left (CUDA out of memory. Tried to allocate 2.00 GiB): choose fewer",
     ),
     "a full memory": (MemoryError(), "no memory left (no reason given): choose fewer"),
+    "a full memory behind a file": (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory left"),
+    "no thread": (RuntimeError("can't start new thread"), "memory left (can't start new thread)"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }
 
@@ -31,6 +34,13 @@ SENTENCES = {
 def test_a_known_error_is_a_sentence(case):
     error, sentence = SENTENCES[case]
     assert sentence in error_message(error)
+
+
+def test_torch_s_full_memory_is_a_sentence():
+    with pytest.raises(RuntimeError) as raised:
+        torch.empty(2**60)
+    found = r"left \(can't allocate memory: you tried to allocate \d+ bytes\): choose fewer"
+    assert re.search(found, error_message(raised.value))
 
 
 @pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
