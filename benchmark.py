@@ -18,11 +18,11 @@ if __name__ == "__main__":
     check_command("benchmark")
 
 from omegaconf import DictConfig
-from rich.console import Console
 
 from asysplat.errors import InputError
 from asysplat.files import check_writable
 from asysplat.runs.revision import revision
+from asysplat.terminal import make_console
 from benchmarks.compare import compare, read_old
 from benchmarks.options import describe_machine, find_suite
 from benchmarks.table import write_results
@@ -37,7 +37,7 @@ def benchmark(options: DictConfig) -> None:
     path = Path(options.output) / options.suite
     check_writable(path.parent, "output")
     old = read_old(options.compare, path.with_suffix(".json"))
-    console = Console()
+    console = make_console()
     code = {"suite": options.suite, "revision": revision()}
     results = code | {"machine": describe_machine()} | suite.measure(options, console)
     tables = suite.tables(results)
@@ -50,7 +50,7 @@ def benchmark(options: DictConfig) -> None:
     if old is not None:
         comparison = compare(old, results, suite.TRACKED)
         for line in comparison.lines():
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+            console.print(line, soft_wrap=True, highlight=False)
         worse = bool(comparison.worse)
     if hasattr(suite, "verdict") and (message := suite.verdict(results)):
         sys.exit(message)

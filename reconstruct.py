@@ -24,7 +24,6 @@ if __name__ == "__main__":
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from asysplat import load
 from asysplat.data.cameras import CameraOptions
@@ -42,6 +41,7 @@ from asysplat.root import typed
 from asysplat.runs.device import find_device
 from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
+from asysplat.terminal import make_console
 
 
 @command("reconstruct")
@@ -67,7 +67,7 @@ def reconstruct(config: DictConfig) -> None:
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     options = {name: config[name] for name in names}
     where = Path(config.paths.logs) / "cameras"
-    options["cameras"] = CameraOptions(config.cameras, where, config.frames, Console())
+    options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
     # an error of names comes before the work
     find_views(config.video, photographs.input_files, photographs.held_out_files)

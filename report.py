@@ -15,7 +15,6 @@ if __name__ == "__main__":
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.progress import track
 
 from asysplat.files import atomic_write, make_folder
@@ -27,6 +26,7 @@ from asysplat.report.paper import find_tables
 from asysplat.report.runs import report_runs
 from asysplat.report.terminal import render_terminal
 from asysplat.runs.systems import find_systems
+from asysplat.terminal import make_console
 
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "runs", "output")
 
@@ -46,7 +46,7 @@ def report(options: DictConfig) -> None:
     filled = [fill_table(table, overrides, compose_train, runs, systems) for table in tables]
     if options.costs:
         filled = [with_costs(table, compose_train) for table in track(filled, "counting costs")]
-    console = Console()
+    console = make_console()
     render_terminal(filled, console)
     with atomic_write(folder / "report.md") as partial:
         partial.write_text(render_markdown(filled))

@@ -1,4 +1,4 @@
-"""Tables on the terminal, of all their columns."""
+"""The terminal: names as they are, and tables of all their columns."""
 
 from collections.abc import Collection, Sequence
 
@@ -10,6 +10,14 @@ from rich.text import Text
 
 NAMES_FRACTION = 1 / 3  # greatest fraction of the terminal's width for the names of the rows
 UNLIMITED = 10_000  # characters
+
+
+def make_console(stderr: bool = False) -> Console:
+    """Make a console that prints names as they are: "[b]" or ":x:" in that of a file is no markup.
+
+    It prints to the standard output, or to `stderr`.
+    """
+    return Console(stderr=stderr, markup=False, emoji=False)
 
 
 def print_table(

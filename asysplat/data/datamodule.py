@@ -12,6 +12,7 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.utilities import rank_zero_only
+from rich.markup import escape
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Subset
 
@@ -278,7 +279,7 @@ class FixedTasks(Dataset):
         # Processes side by side would draw over each other; `rank` is set by Lightning.
         rank = rank_zero_only.rank  # ty: ignore[missing-attribute]
         alone = rank == 0 and current_process().name == "MainProcess"
-        shown = track(tasks, f"loading {name}", transient=True, disable=not alone)
+        shown = track(tasks, escape(f"loading {name}"), transient=True, disable=not alone)
         for task in shown:
             self._loaded.append(load(task, points=points))
             size += sum(self._loaded[-1][views].images.nbytes for views in ("inputs", "targets"))

@@ -24,6 +24,7 @@ from asysplat.evaluation.post_optimization import PostOptimization, Predict, Sce
 from asysplat.evaluation.rows import ImageRow, average
 from asysplat.files import atomic_write, make_folder
 from asysplat.rendering import Rendering
+from asysplat.terminal import make_console
 
 Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own first
 
@@ -54,8 +55,9 @@ def measure_scenes(
     make_folder(scene_folder, "paths.logs")
     make_folder(folder / "figures", "paths.logs")
     main, last = next(iter(tests)), measure.steps[-1]
-    columns = (TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as bars:
+    columns = [TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn()]
+    columns += [TimeElapsedColumn(), TimeRemainingColumn()]
+    with Progress(*columns, console=make_console()) as bars:
         scenes = bars.add_task("scenes", total=sum(map(len, tests.values())))
         steps = bars.add_task("steps", total=last)
 

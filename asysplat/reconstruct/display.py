@@ -6,11 +6,11 @@ import time
 from types import FrameType
 
 from rich import progress
-from rich.console import Console
 
 from asysplat.export.viewer import Viewer
 from asysplat.refinement.refine import Refinement, RefinementProgress, Refining
 from asysplat.scene import Gaussians
+from asysplat.terminal import make_console
 
 VIEWER_SECONDS = 1.0  # between two updates of the viewer
 PRINT_SECONDS = 10.0  # between two lines where there is no terminal
@@ -27,7 +27,7 @@ class RefinementDisplay:
     def __init__(self, viewer: Viewer | None = None):
         self.last: RefinementProgress | None = None
         self.stopped = False
-        self._terminal = Console().is_terminal
+        self._terminal = make_console().is_terminal
         self._printed = self._shown = time.monotonic()
         self._viewer = viewer
         if viewer is not None:

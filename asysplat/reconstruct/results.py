@@ -12,7 +12,6 @@ import torch
 from hydra.utils import instantiate
 from jaxtyping import Bool, Float
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from torch import Tensor
 
 from asysplat.data.photographs import Photographs
@@ -33,7 +32,7 @@ from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import PICTURE, SCENE
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
 from asysplat.scene import Cameras, Gaussians, Views
-from asysplat.terminal import print_table
+from asysplat.terminal import make_console, print_table
 
 BYTES_PER_GAUSSIAN = 4 * 62  # size in one of the files, at most
 OTHER_BYTES = 20_000_000  # space for the figures and the video
@@ -265,4 +264,4 @@ def _print_table(results: dict[str, float | int | str]) -> None:
         for title, row in rows.items()
         if f"{row}/psnr" in results
     ]
-    print_table(Console(), ["", *(METRICS[metric] for metric in metrics)], cells)
+    print_table(make_console(), ["", *(METRICS[metric] for metric in metrics)], cells)

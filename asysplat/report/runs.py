@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from rich.console import Console
 from rich.text import Text
 
 from asysplat.errors import InputError
@@ -31,6 +30,7 @@ from asysplat.report.terminal import print_grid
 from asysplat.root import typed
 from asysplat.runs.runs import PICTURE
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells
+from asysplat.terminal import make_console
 
 PNG = b"\x89PNG\r\n\x1a\n"
 GENERATOR = b'<meta name="generator" content="asysplat report">'  # as in base.html.jinja
@@ -84,7 +84,7 @@ def report_runs(folder: Path, output: Path | None = None) -> None:
     page = output if named else (output or folder) / "index.html"
     make_folder(page.parent, "output")
     _check_own(page)
-    console = Console()
+    console = make_console()
     print_grid(make_overview(folder, runs), console)
     for sentence in left_out:
         console.print(Text(f"left out: {sentence}"), soft_wrap=True)

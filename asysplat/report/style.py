@@ -3,6 +3,7 @@
 INK, FAINT, OURS, PAPER = "#101112", "#909192", "#1f6feb", "#c2570c"
 STYLE = {
     "svg.fonttype": "none",
+    "text.parse_math": False,  # $ in a name is a letter
     "font.size": 11,
     "axes.titlesize": 11,
     "axes.spines.top": False,

@@ -6,13 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.evaluation.metrics import METRICS
 from asysplat.files import atomic_write
-from asysplat.terminal import print_table
+from asysplat.terminal import make_console, print_table
 
 Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 
@@ -70,7 +68,7 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
     """
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
-    console = Console()
+    console = make_console()
     if data in test_sets:
         metrics = [name for name in METRICS if f"test/{data}/{name}" in results]
         ending = f"/test/{data}/psnr"
@@ -114,7 +112,7 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
             inputs = metric_cells(results, f"inputs/{name}/{method}", ["psnr"])
             cells = metric_cells(results, prefix, metrics)
             rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
-        print_table(Console(), titles, rows, title)
+        print_table(make_console(), titles, rows, title)
     _print_figures(folder, "evaluation")
     print(f"evaluation: {folder}")
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Column, Table
 
 from asysplat.evaluation.metrics import METRICS
 from asysplat.runs.runs import Run, find_run
 from asysplat.runs.summary import BASELINE_ROWS, metric_cells
+from asysplat.terminal import make_console
 
 Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration, its finished run
 
@@ -36,7 +36,7 @@ class SweepTable(Callback):
     def _print(self, config: DictConfig) -> None:
         jobs = read_jobs(Path(config.hydra.sweep.dir), Path(config.paths.logs))
         if any(run is not None for *_, run in jobs):
-            Console().print(sweep_table(jobs))
+            make_console().print(sweep_table(jobs))
         if jobs and not self.complete:
             print("The sweep is not finished: the same command skips the jobs that are.")
 

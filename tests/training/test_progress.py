@@ -81,7 +81,7 @@ def test_lines_between_validations(tmp_path, capsys, monkeypatch):
 def terminal(monkeypatch):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=80)
-    monkeypatch.setattr(progress, "Console", lambda: console)
+    monkeypatch.setattr(progress, "make_console", lambda: console)
     monkeypatch.setattr(progress, "REFRESH_SECONDS", 0)
     return screen
 

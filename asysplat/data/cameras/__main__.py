@@ -7,12 +7,11 @@ import sys
 from argparse import ArgumentParser
 from pathlib import Path
 
-from rich.console import Console
-
 from asysplat.data.cameras.find import find_cameras
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 from asysplat.interrupts import handle_signals
+from asysplat.terminal import make_console
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -26,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
         folder = find_cameras(
-            options.path, options.out, options.frames, options.on_bad_image, Console()
+            options.path, options.out, options.frames, options.on_bad_image, make_console()
         )
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

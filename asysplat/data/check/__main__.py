@@ -21,6 +21,7 @@ from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 from asysplat.interrupts import handle_signals
+from asysplat.terminal import make_console
 
 MAX_SCENES = 3  # checked of a folder of more
 
@@ -35,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
     parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
     try:
-        return check(parser.parse_args(arguments), Console())
+        return check(parser.parse_args(arguments), make_console())
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

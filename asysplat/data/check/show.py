@@ -49,7 +49,8 @@ def draw_report(report: Report, title: str) -> Figure:
     image_height = min(WIDTH / MAX_PAIRS * cameras.height / cameras.width, MAX_IMAGE_HEIGHT)
     pair_height = 2 * (image_height + TITLE_HEIGHT)
     figure = Figure(figsize=(WIDTH, PATH_HEIGHT + pair_height), layout="constrained")
-    figure.suptitle(f"{title}: {report.verdict.summary}", wrap=True)
+    summary = f"{title}: {report.verdict.summary}"
+    figure.suptitle(summary.replace("$", r"\$"), wrap=True)  # else a formula
     heights = (PATH_HEIGHT, pair_height)
     paths, images = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _draw_path(report, *paths.subplots(1, 2))

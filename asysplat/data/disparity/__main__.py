@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from numpy import ndarray
-from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from torch.nn.functional import interpolate
 
@@ -25,6 +25,7 @@ from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 from asysplat.interrupts import handle_signals
+from asysplat.terminal import make_console
 
 CACHE = Path("~/.cache/asysplat/disparities")  # as in conf/data/disk.yaml
 MAX_SHORT_SIDE = 272  # pixels of a map: the loss compares every second pixel of 544
@@ -81,7 +82,8 @@ def write_maps(
     images = [image.file for image in posed.images if image.lens.model != PANORAMA]
     missing = [image for image in images if not (folder / map_name(image, scene)).exists()]
     written, kept = 0, len(images) - len(missing)
-    for image in track(missing, posed.name, console=Console(stderr=True), transient=True):
+    console = make_console(stderr=True)
+    for image in track(missing, escape(posed.name), console=console, transient=True):
         for pixels in bad.read_each(load_image, [(image,)]):
             disparity = shrink(estimate(pixels), *pixels.shape[:2])
             write_map(folder / map_name(image, scene), disparity)

@@ -7,7 +7,8 @@ from multiprocessing import current_process
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich import progress
-from rich.console import Console
+
+from asysplat.terminal import make_console
 
 REFRESH_SECONDS = 0.2
 SPEED_SECONDS = 3600  # period of training from which the remaining time is estimated
@@ -80,7 +81,7 @@ class TrainingProgressBar(ProgressBar):
             self._close(trainer)
 
     def _open(self) -> None:
-        console = Console()
+        console = make_console()
         # Runs side by side would draw over each other.
         self.on_terminal = console.is_terminal and current_process().name == "MainProcess"
         self.bars = progress.Progress(

@@ -1,0 +1,43 @@
+"""Names and options of a stranger are printed as they are."""
+
+import ast
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from asysplat.runs.runs import Run
+from asysplat.runs.sweep_table import sweep_table
+from asysplat.terminal import make_console, print_table
+
+HOSTILE = "[/b] [red]x :smile: test_sets=[replica]"
+
+
+def test_names_are_printed_as_they_are(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    make_console().print(HOSTILE, soft_wrap=True)
+    print_table(make_console(), ["", HOSTILE], [[HOSTILE, "1"]], title=HOSTILE)
+    assert capsys.readouterr().out.count(HOSTILE) == 4
+    make_console(stderr=True).print(HOSTILE)
+    assert capsys.readouterr() == ("", f"{HOSTILE}\n")
+
+
+def test_a_sweep_shows_its_options_as_they_are(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    config = OmegaConf.create({"data": {"name": HOSTILE}, "metrics": {"name": "[/]"}})
+    run = Run(Path(), "", 0, "", {"cost/parameters": 1.0})
+    jobs = [({"test_sets": value}, config, run) for value in ("[replica]", "[/b]")]
+    make_console().print(sweep_table(jobs))
+    out = capsys.readouterr().out
+    assert f"test scenes: {HOSTILE}, metrics: [/]" in out and "[replica]" in out and "[/b]" in out
+
+
+def test_no_other_console_is_made(repository):
+    files = [*repository.glob("*.py"), *repository.glob("asysplat/**/*.py")]
+    files += repository.glob("benchmarks/**/*.py")
+    calls = [
+        f"{file.name}:{node.lineno}"
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("Console", "rich.print", "rich.console.Console")
+    ]
+    assert len(calls) == 1 and calls[0].startswith("terminal.py:")
