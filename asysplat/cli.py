@@ -96,7 +96,7 @@ def exit_with_message(stopped: str) -> Iterator[None]:
 
 
 def error_message(error: BaseException) -> str | None:
-    """Return a sentence for an InputError, a full disk or memory, or a lost loader; else None.
+    """Return a sentence for an InputError, a full disk or memory, or a lost process; else None.
 
     `error` may also have been raised from one of them.
     """
@@ -113,6 +113,11 @@ def error_message(error: BaseException) -> str | None:
                 f"a process that loads data was lost ({cause}); if memory was short, set "
                 "data.num_workers lower."
             )
+        if _is_lost_connection(cause):
+            return (
+                "the connection to another process of this training was lost: see what ended that "
+                "process, above or in its own output."
+            )
         if _is_out_of_memory(cause):
             # Without torch's line of source before, and the state of its memory after.
             reason = str(cause).rpartition("DefaultCPUAllocator: ")[2]
@@ -123,6 +128,14 @@ def error_message(error: BaseException) -> str | None:
             )
         cause = cause_of(cause)
     return None
+
+
+def _is_lost_connection(error: BaseException) -> bool:
+    """Return whether an error is that of NCCL or Gloo where another process has ended."""
+    if type(error).__name__ in ("DistBackendError", "DistNetworkError"):  # torch's
+        return True
+    words = ("reset by peer", "closed by peer", "Broken pipe")
+    return "gloo" in str(error) and any(word in str(error) for word in words)
 
 
 def _is_out_of_memory(error: BaseException) -> bool:

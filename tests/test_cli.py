@@ -14,6 +14,7 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
 FULL_AS_CAUSE = RuntimeError("write")
 FULL_AS_CAUSE.__cause__ = FULL
 LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
+LOST_PEER = RuntimeError("[/gloo/transport/tcp/pair.cc:545] Read error: Connection reset by peer.")
 SENTENCES = {
     "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
     "a full disk": (FULL, "no space on the disk for logs/events (No space left on device)"),
@@ -25,6 +26,7 @@ SENTENCES = {
     ),
     "a full memory": (MemoryError(), "no memory left (no reason given): choose fewer"),
     "a full memory behind a file": (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory left"),
+    "a lost peer": (LOST_PEER, "the connection to another process of this training was lost"),
     "no thread": (RuntimeError("can't start new thread"), "memory left (can't start new thread)"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }

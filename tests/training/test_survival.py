@@ -156,3 +156,20 @@ def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
     assert f"resuming from {last}" in text and text.count("stopped; to go on") == 2
     assert "error: a process that loads data was lost (DataLoader worker (pid" in text
     assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    "killed", [pytest.param("other", marks=pytest.mark.medium), pytest.param("main", marks=SLOW)]
+)
+def test_one_of_two_processes_is_killed(train, killed):
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "data.batch_size=2"]
+    options = [*two, "steps=1000", "validate_every=1000", "callbacks.checkpoints.minutes=0"]
+    with train.start("name=two", *options, until="previous.ckpt") as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        (other,) = (c for c in children if b"train.py" in Path(f"/proc/{c}/cmdline").read_bytes())
+        os.kill(process.pid if killed == "main" else int(other), signal.SIGKILL)
+        _, errors = process.communicate(timeout=120)  # both have closed the pipe
+    assert "error: the connection to another process of this training was lost" in errors
+    assert "Traceback" not in errors
+    last = folder_of(train, "two") / "checkpoints" / "last.ckpt"
+    assert read_metadata(last)["global_step"] > 0
