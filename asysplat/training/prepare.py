@@ -14,6 +14,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
@@ -89,13 +90,14 @@ class TrainingStage:
             InputError: the weights do not fit the model.
         """
         load_weights(self.weights, module)
-        print(f"{self.config.stage}: {describe_stage(self.config)}")
-        print(f"model: {module.net.describe()}")
+        say = rank_zero_only(print)
+        say(f"{self.config.stage}: {describe_stage(self.config)}")
+        say(f"model: {module.net.describe()}")
         options = plain_options(self.config)
         module.save_hyperparameters(options, logger=False)
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
-            print(f"not as before: {difference}")
+            say(f"not as before: {difference}")
         cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
@@ -124,11 +126,11 @@ class TrainingStage:
         """
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
-        if trainer.is_global_zero:
-            print(split)
         resumes = has_checkpoints(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(self.config, self.folder / "config.yaml", resolve=True)
+        if trainer.is_global_zero:
+            print(split)
+            OmegaConf.save(self.config, self.folder / "config.yaml", resolve=True)
         if trainer.logger is not None and not resumes:
             log_choices(trainer.logger, self.config)
 

@@ -168,8 +168,9 @@ def test_one_of_two_processes_is_killed(train, killed):
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         (other,) = (c for c in children if b"train.py" in Path(f"/proc/{c}/cmdline").read_bytes())
         os.kill(process.pid if killed == "main" else int(other), signal.SIGKILL)
-        _, errors = process.communicate(timeout=120)  # both have closed the pipe
+        output, errors = process.communicate(timeout=120)  # both have closed the pipe
     assert "error: the connection to another process of this training was lost" in errors
     assert "Traceback" not in errors
+    assert output.count("model: ") == 1
     last = folder_of(train, "two") / "checkpoints" / "last.ckpt"
     assert read_metadata(last)["global_step"] > 0
