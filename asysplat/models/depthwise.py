@@ -38,7 +38,8 @@ class _DepthwiseConv(torch.autograd.Function):
     def backward(ctx, grad_output):
         tokens, weight = ctx.saved_tensors
         length, size, before = tokens.shape[1], weight.shape[-1], ctx.before
-        grad_tokens = _convolve(grad_output, weight.flip(-1), None, size - 1 - before)
+        with without_autocast(tokens):
+            grad_tokens = _convolve(grad_output, weight.flip(-1), None, size - 1 - before)
         padded = _pad(tokens, size, before)
         grad_output = grad_output.to(torch.promote_types(grad_output.dtype, torch.float32))
         taps = [(padded[:, k : k + length] * grad_output).sum((0, 1)) for k in range(size)]

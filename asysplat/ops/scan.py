@@ -175,7 +175,8 @@ def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tupl
         ctx.save_for_backward(*tensors, output[1])
 
     def gradients(ctx, grad_output, _):
-        grads = backward(ctx.backend, grad_output, *ctx.saved_tensors, ctx.reverse)
+        with without_autocast(grad_output):  # in which backward() may have been called
+            grads = backward(ctx.backend, grad_output, *ctx.saved_tensors, ctx.reverse)
         return None, *grads, None, None
 
     forward.register_autograd(gradients, setup_context=save)

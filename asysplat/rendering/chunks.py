@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.kernels.precision import without_autocast
 from asysplat.rendering.interface import RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
@@ -109,7 +110,7 @@ class _Deferred(torch.autograd.Function):
         for views in ctx.slices:
             selected = zip(_select(ctx.saved_tensors, views), needed, strict=True)
             inputs = [tensor.detach().requires_grad_(need) for tensor, need in selected]
-            with torch.enable_grad():
+            with torch.enable_grad(), without_autocast(inputs[0]):
                 images, _ = ctx.draw_views(views, inputs)
             outputs = [
                 (image, grad.unflatten(0, shape)[:, views])

@@ -46,6 +46,15 @@ def test_tokens_in_half_precision():
         assert (result.float() - value).norm() <= 1e-2 * value.norm()
 
 
+def test_a_backward_pass_under_autocast_has_the_same_bits():
+    leaves = inputs(4, torch.float32)
+    grad_output = torch.randn(2, 9, 6, generator=torch.Generator().manual_seed(1))
+    expected = torch.autograd.grad(depthwise_conv(*leaves, 3), leaves, grad_output)
+    with torch.autocast("cpu", torch.bfloat16):
+        grads = torch.autograd.grad(depthwise_conv(*leaves, 3), leaves, grad_output)
+    assert all(map(torch.equal, grads, expected))
+
+
 def test_a_convolution_may_have_no_bias():
     tokens, weight, _ = inputs(3)
     expected = as_sequences(tokens, weight, None, 1)

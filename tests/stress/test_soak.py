@@ -4,8 +4,10 @@ As a program, refine a scene: every gradient is finite, and the result is drawn 
 
 python tests/stress/test_soak.py path/to/scene 1000
 NUMBA_BOUNDSCHECK=1 python tests/stress/test_soak.py path/to/scene 1000, with memory poisoned too
+python tests/stress/test_soak.py render, the memory that a thousand calls leave behind
 """
 
+import gc
 import json
 import os
 import subprocess
@@ -17,7 +19,8 @@ import pytest
 from backends import FAST, assert_same_bits, both_ways
 from poison import FILLS, poisoned
 
-from asysplat import Gaussians, Views, open_photographs, refine, render
+from asysplat import Gaussians, Views, load, open_photographs, refine, render
+from asysplat.data import ProceduralScene
 from asysplat.evaluation.baselines import mean_color_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import RefinementSettings
@@ -55,6 +58,31 @@ def test_training_for_three_hundred_steps(shared, repository, tmp_path, extra):
     assert numbers["test/files/psnr"] > numbers["baseline/files/mean_color/psnr"] + 1
 
 
+@pytest.mark.parametrize("call", ["render", "refine", "load"])
+def test_memory_stays_flat_over_a_thousand_calls(repository, call):
+    grown = json.loads(run([__file__, call], repository, {}))
+    print(f"{call}: {grown} MB from the 200th to the 1,000th call")
+    assert grown < 20
+
+
+def memory_growth(call: str) -> float:
+    """Measure by how many MB this process grows from the 200th to the 1,000th call."""
+    views = ProceduralScene(0, 48, 64, 4).views(range(4))
+    gaussians = load("shipped")(views)
+    calls = {
+        "render": lambda: render(gaussians, views.cameras),
+        "refine": lambda: refine(gaussians, views, steps=1),
+        "load": lambda: load("shipped"),
+    }
+    sizes = []
+    for _ in range(1000):
+        calls[call]()
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        sizes.append(pages * os.sysconf("SC_PAGESIZE") / 1e6)
+    return round(max(sizes[-10:]) - max(sizes[190:200]), 1)
+
+
 def refine_and_draw(views: Views, start: Gaussians, steps: int) -> Gaussians:
     """Check that no gradient is NaN, and that the result is drawn the same twice."""
     non_finite = []
@@ -71,7 +99,9 @@ def refine_and_draw(views: Views, start: Gaussians, steps: int) -> Gaussians:
     return found
 
 
-if __name__ == "__main__":
+if __name__ == "__main__" and len(sys.argv) == 2:
+    print(memory_growth(sys.argv[1]))
+elif __name__ == "__main__":
     scene, steps = sys.argv[1], int(sys.argv[2])
     checked = numba.config.BOUNDSCHECK
     with poisoned(FILLS[0] if checked else None):

@@ -114,6 +114,26 @@ def test_first_non_finite_tensor():
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize("optimizer", ["adamw", "muon"])
+def test_spikes_in_mixed_precision_leave_finite_weights(composed, tmp_path, capsys, optimizer):
+    """Finite spikes, beyond what bfloat16 squares, are clipped or dropped; others are dropped."""
+    spikes = [1, 1e30, 0.5, float("inf"), 1e6, float("nan"), 1]
+    options = ["training.loss.depth=0.0", f"training/optimizer={optimizer}"]
+    config = composed(*NETWORK, *STEPS, *VIEWS, *options)
+    module = instantiate(config.training, net=instantiate(config.model))
+    before = [parameter.clone() for parameter in module.parameters()]
+    scenes = [noise(4, size=32, scale=s, name=f"scene {i}") for i, s in enumerate(spikes)]
+    loader = DataLoader(scenes, collate_fn=collate)
+    callback = NonFiniteSteps()
+    fit(module, callback, tmp_path, loader, precision="bf16-mixed", gradient_clip_val=1.0)
+    assert all(value.isfinite().all() for value in module.state_dict().values())
+    changed = [not torch.equal(a, b) for a, b in zip(before, module.parameters(), strict=True)]
+    assert any(changed) and 2 <= callback.count <= 4 and callback.in_a_row == 0
+    output = capsys.readouterr().out
+    assert "scene 3; the step is dropped" in output and "scene 5; the step is dropped" in output
+
+
+@pytest.mark.medium
 def test_first_non_finite_tensor_of_the_network(composed, tmp_path, capsys):
     config = composed(*NETWORK, *STEPS, *VIEWS, "training.loss.depth=0.0")
     net = instantiate(config.model)

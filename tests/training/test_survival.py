@@ -71,11 +71,12 @@ def rows(path):
         return [row | {"minutes": None} for row in csv.DictReader(file)]
 
 
+def load_weights(folder):
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
 def check_same(whole, killed):
-    weights, survived = (
-        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-        for folder in (whole, killed)
-    )
+    weights, survived = load_weights(whole), load_weights(killed)
     assert weights.keys() == survived.keys()
     assert [name for name in weights if not torch.equal(weights[name], survived[name])] == []
     for name in ("curve.csv", "metrics.csv"):
@@ -111,6 +112,24 @@ def test_a_killed_run_ends_with_the_same_bits_and_logs(
     finished(train("name=whole", *options, "ckpt_path=last"))
     assert events.scalars(whole) == before
     check_same(whole, folder_of(train, "killed"))
+
+
+@pytest.mark.medium
+def test_a_clock_that_jumps_changes_nothing(train, monkeypatch):
+    options = [*OPTIONS, "steps=4", "validate_every=2"]
+    whole = finished(train("name=whole", *options))
+    jumps, clock = random.Random(0), time.time
+    monkeypatch.setattr(time, "time", lambda: clock() + jumps.uniform(-86_400, 86_400))
+    jumped = finished(train("name=jumped", *options))
+    weights = [load_weights(folder) for folder in (whole, jumped)]
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+    assert rows(whole / "metrics.csv") == rows(jumped / "metrics.csv") != []
+    # The times of events jump, too, and so does the order in which `scalars` returns them.
+    logged = [{k: sorted(v) for k, v in events.scalars(f).items()} for f in (whole, jumped)]
+    assert logged[0] == logged[1] != {}
+    with (jumped / "curve.csv").open() as file:
+        minutes = [float(row["minutes"]) for row in csv.DictReader(file)]
+    assert minutes == sorted(minutes) and minutes[0] >= 0 and minutes[-1] < 10
 
 
 @pytest.mark.medium

@@ -1,6 +1,7 @@
 """Drop, count and report steps with non-finite gradients."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass
 from functools import partial
 from typing import Any
@@ -85,8 +86,8 @@ class NonFiniteSteps(Callback):
             for batch, states in self.batches:
                 set_random_states(states)
                 for scene in split(batch):
-                    with trainer.precision_plugin.forward_context():
-                        first = first_non_finite(module, scene)
+                    context = trainer.precision_plugin.forward_context
+                    first = first_non_finite(module, scene, context)
                     if first is not None:
                         return first, scene["scene"]
         finally:
@@ -97,12 +98,17 @@ class NonFiniteSteps(Callback):
         module.log("train/non_finite_steps", float(self.count))
 
 
-def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
+def first_non_finite(
+    module: LightningModule,
+    batch: Batch,
+    context: Callable[[], AbstractContextManager] = nullcontext,
+) -> str | None:
     """Compute a batch's loss and gradients; name the first tensor that is NaN or infinite.
 
     The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
     at those outputs from the last to the first, gradients of parameters. `module` has
-    `scene_terms(batch, net)`, whose "loss" is minimized; it is left as it was.
+    `scene_terms(batch, net)`, whose "loss" is minimized; it is left as it was. `context` is that of
+    the forward pass, such as autocast.
     """
     names: list[str] = []
 
@@ -126,7 +132,8 @@ def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
     buffers = [buffer.clone() for buffer in module.buffers()]
     try:
         with torch.enable_grad():
-            terms = module.scene_terms(batch, module.net)
+            with context():
+                terms = module.scene_terms(batch, module.net)
             for name, term in terms.items():
                 check(f"the term {name} of the loss", term)
             trained = {name: p for name, p in module.named_parameters() if p.requires_grad}

@@ -86,6 +86,15 @@ def test_autocast_changes_nothing(path):
     assert_same_bits(Result(y, grads), plain)
 
 
+@pytest.mark.parametrize("name", SCANS)
+def test_kernels_backward_pass_under_autocast_has_the_same_bits(name):
+    path, leaves = (name, "cpu"), [a.requires_grad_() for a in make_arguments(name, 67)]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y = run(path, leaves)
+        grads = torch.autograd.grad(y, leaves, random_grad_output(y))
+    assert_same_bits(Result(y, grads), both_ways(path, leaves))
+
+
 def assert_same_bits(one: Result, other: Result) -> None:
     for name, value in one.named().items():
         assert torch.equal(value, other.named()[name]), name
