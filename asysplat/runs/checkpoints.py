@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
@@ -46,15 +45,14 @@ def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None
     else:
         path = Path(ckpt_path)
     damage, before = _damage(path), path.with_name(PREVIOUS)
-    say = rank_zero_only(print)
     if damage and path.name == LAST and _damage(before) is None:
-        say(f"{path} {damage}: resuming from the one before it", flush=True)
+        print(f"{path} {damage}: resuming from the one before it", flush=True)
         path, damage = before, None
     if damage:
         raise InputError(
             f"ckpt_path={path} {damage}: name a .ckpt file that a run has written, or last."
         )
-    say(f"resuming from {path}", flush=True)
+    print(f"resuming from {path}", flush=True)
     return path
 
 

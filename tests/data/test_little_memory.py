@@ -66,15 +66,15 @@ def enlarge(folder) -> None:
 def test_two_thousand_photographs(reconstruct, tmp_path):
     write_scene(tmp_path / "many", 2000)
     for options in ((), ("views=null",)):
-        assert reconstruct(tmp_path / "many", "seconds=5", *options)[0] == 0
+        assert reconstruct(tmp_path / "many", "cameras=given", "seconds=5", *options)[0] == 0
 
 
 def test_fifty_megapixels(reconstruct, tmp_path):
     write_scene(tmp_path / "large", 12)
     enlarge(tmp_path / "large")
-    code, _ = reconstruct(tmp_path / "large", "seconds=5", "height=1080")
+    code, _ = reconstruct(tmp_path / "large", "cameras=given", "seconds=5", "height=1080")
     assert code == 0
     before = sorted(tmp_path.rglob("*"))
-    code, errors = reconstruct(tmp_path / "large", "seconds=5", "height=5760")
+    code, errors = reconstruct(tmp_path / "large", "cameras=given", "seconds=5", "height=5760")
     assert code == 1 and errors.startswith("error: there is no memory left"), errors
     assert errors.count("\n") == 1 and sorted(tmp_path.rglob("*")) == before
