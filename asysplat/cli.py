@@ -132,10 +132,10 @@ def error_message(error: BaseException) -> str | None:
 
 def _is_lost_connection(error: BaseException) -> bool:
     """Return whether an error is that of NCCL or Gloo where another process has ended."""
-    if type(error).__name__ in ("DistBackendError", "DistNetworkError"):  # torch's
-        return True
+    message = str(error)  # errors of their set-up, such as a port in use, have the same types
     words = ("reset by peer", "closed by peer", "Broken pipe")
-    return "gloo" in str(error) and any(word in str(error) for word in words)
+    by_gloo = "gloo" in message and any(word in message for word in words)
+    return by_gloo or "remote process exited" in message
 
 
 def _is_out_of_memory(error: BaseException) -> bool:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 from torch import Tensor
@@ -112,7 +113,7 @@ def measure(options: DictConfig, console: Console) -> Result:
             return {metric: values.mean().item() for metric, values in metrics.items()}
 
         where = {"scene": scene_name, "photographs": config["photographs"], "limit": marks[-1]}
-        for name in track(names, scene_name, console=console, transient=True):
+        for name in track(names, escape(scene_name), console=console, transient=True):
             if name == NETWORK:
                 found = measure_network(photographs, quality)
             else:

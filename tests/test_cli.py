@@ -27,6 +27,10 @@ SENTENCES = {
     "a full memory": (MemoryError(), "no memory left (no reason given): choose fewer"),
     "a full memory behind a file": (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory left"),
     "a lost peer": (LOST_PEER, "the connection to another process of this training was lost"),
+    "a lost peer by NCCL": (
+        torch.distributed.DistBackendError("NCCL error: remote process exited or there was a"),
+        "the connection to another process of this training was lost",
+    ),
     "no thread": (RuntimeError("can't start new thread"), "memory left (can't start new thread)"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }
@@ -45,7 +49,13 @@ def test_torch_s_full_memory_is_a_sentence():
     assert re.search(found, error_message(raised.value))
 
 
-@pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
+PORT_IN_USE = torch.distributed.DistNetworkError(
+    "The server socket failed to listen: EADDRINUSE"
+)
+OTHERS = [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1), PORT_IN_USE]
+
+
+@pytest.mark.parametrize("error", OTHERS)
 def test_other_errors_have_no_message(error):
     assert error_message(error) is None
 
