@@ -49,9 +49,7 @@ def test_torch_s_full_memory_is_a_sentence():
     assert re.search(found, error_message(raised.value))
 
 
-PORT_IN_USE = torch.distributed.DistNetworkError(
-    "The server socket failed to listen: EADDRINUSE"
-)
+PORT_IN_USE = torch.distributed.DistNetworkError("The server socket failed to listen: EADDRINUSE")
 OTHERS = [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1), PORT_IN_USE]
 
 
