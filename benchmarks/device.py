@@ -61,12 +61,13 @@ TRACKED = TrackedMetrics(
     must_match=("sizes", "precision"),
     kinds={"kernels": TIME, "error": ERROR},
 )
-SECONDS = 6.0  # no round of an operator begins after so many seconds
+SECONDS = 3.0  # no round of an operator begins after so many seconds
 AGREEMENT = 0.05  # greatest relative difference of outputs that are timed: bf16, other cut-offs
 NUMBERS = (3, 4, 3, 1, 12)  # numbers of a Gaussian with SH of degree 1
 SIZES: dict[str, dict[str, Sizes]] = {  # of the operators that each type of device has kernels for
     "cuda": {
         "render": {"gaussians": 100_000, "height": 540, "width": 960},
+        "render_1M": {"gaussians": 1_000_000, "height": 1080, "width": 1920},
         "ssd": {"batch": 1, "length": 8192, "heads": 28, "head_dim": 64, "state": 256},
         "selective_scan": {"batch": 32, "length": 1024, "channels": 128, "state": 16},
         "plane_sweep": {"batch": 1, "views": 16, "height": 128, "width": 128}
@@ -102,14 +103,15 @@ class Case(NamedTuple):
     Args:
         check: compares a backend with the reference on a small case.
         run: runs a backend, both passes where there are two, and returns the output.
-        kernels, torch: names of the backends with kernels and in torch.
+        kernels: name of the backend with kernels.
+        torch: name of the backend in torch; None where it would take minutes.
         library: name of a library with the operator, and a function that prepares its run.
     """
 
     check: Check
     run: Callable[[str], Tensor]
     kernels: str
-    torch: str
+    torch: str | None
     library: tuple[str, Callable[[], libraries.Run]] | None = None
 
 
@@ -120,7 +122,9 @@ def choose_precision(operator: str, device: torch.device) -> str:
     return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
 
 
-def _render_case(sizes: Sizes, device: torch.device, backward: bool) -> Case:
+def _render_case(
+    sizes: Sizes, device: torch.device, backward: bool = True, torch_too: bool = True
+) -> Case:
     inputs = prepare_inputs(random_scene(*sizes.values()), device)
     gaussians, cameras, weights = inputs
 
@@ -136,7 +140,7 @@ def _render_case(sizes: Sizes, device: torch.device, backward: bool) -> Case:
 
     last = weights if backward else None
     prepare = partial(libraries.render_by_gsplat, gaussians, cameras, last)
-    return Case(check, run, device.type, REFERENCE, ("gsplat", prepare))
+    return Case(check, run, device.type, REFERENCE if torch_too else None, ("gsplat", prepare))
 
 
 def _operator_case(sizes: Sizes, device: torch.device, operator: str) -> Case:
@@ -195,8 +199,9 @@ def _image_loss_case(sizes: Sizes, device: torch.device) -> Case:
 
 
 CASES: dict[str, Callable[[Sizes, torch.device], Case]] = {
-    "render": partial(_render_case, backward=True),
+    "render": _render_case,
     "render forward": partial(_render_case, backward=False),
+    "render_1M": partial(_render_case, torch_too=False),
     **{
         operator: partial(_operator_case, operator=operator)
         for operator in (*SCANS, PLANE_SWEEP, ATTENTION)
@@ -216,10 +221,11 @@ def measure(options: DictConfig, console: Console) -> Result:
     device = find_device(options.device)
     found = describe_gpu(device) if device.type == "cuda" else processor()
     operators = [name for name in CASES if name.partition(" ")[0] in SIZES[device.type]]
-    rows = [
-        measure_operator(operator, device, options.repeats)
-        for operator in track(operators, "operators", console=console)
-    ]
+    rows = []
+    for operator in track(operators, "operators", console=console):
+        rows.append(measure_operator(operator, device, options.repeats))
+        # On a GPU it takes minutes, and what was measured before an interruption is not lost.
+        console.print(_line(rows[-1]), markup=False, highlight=False, soft_wrap=True)
     names = ", ".join(map(libraries.describe_library, LIBRARIES))
     return {"device": found, "libraries": names, "rows": rows}
 
@@ -261,7 +267,9 @@ def _find_others(case: Case, output: Tensor, row: Result) -> dict[str, libraries
     The row gets a note of a library that does not, and a fault where torch does not agree.
     """
     runs: dict[str, libraries.Run] = {}
-    others = {"torch": ("torch", lambda: partial(case.run, case.torch))}
+    others: dict[str, tuple[str, Callable[[], libraries.Run]]] = {}
+    if case.torch is not None:
+        others["torch"] = ("torch", lambda: partial(case.run, case.torch))
     if case.library and libraries.has_library(case.library[0]):
         others["library"] = case.library
     for kind, (name, prepare) in others.items():
@@ -278,6 +286,15 @@ def _find_others(case: Case, output: Tensor, row: Result) -> dict[str, libraries
         else:
             row["notes"].append(f"{name}'s output differs by {difference:.0%}")
     return runs
+
+
+def _line(row: Result) -> str:
+    """Write an operator's times, or what is wrong."""
+    if row["kernels"] is None:
+        return f"{row['operator']}: {row['fault']}"
+    times = {name: row[name] for name in ("kernels", "torch", "library") if row[name]}
+    words = [f"{name} {1e3 * time['median']:.2f} ms" for name, time in times.items()]
+    return ", ".join([f"{row['operator']}: {words[0]}", *words[1:], row["fault"]]).rstrip(", ")
 
 
 def _error_cell(row: Result) -> str:

@@ -217,7 +217,7 @@ def refine(
 ) -> Gaussians:
     """Refine Gaussians for some seconds or steps, at most for the settings' `max_steps`.
 
-    With `steps`, the same inputs and seed give the same bits.
+    With `steps`, the same inputs and seed give the same bits on a CPU.
 
     Args:
         gaussians, views, background, settings, seed: see `Refinement`.
