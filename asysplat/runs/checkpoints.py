@@ -4,7 +4,7 @@ A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as i
 """
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,16 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # checkpoints of a run to resume 
 WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.", "trainer.num_sanity_val_steps")
 
 
-def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None:
-    """Find the checkpoint that a run resumes from, and print its path.
+def find_checkpoint(
+    ckpt_path: str | None, run: Path, runs: Path, *, say: Callable[[str], object] = print
+) -> Path | None:
+    """Find the checkpoint that a run resumes from, and say its path.
 
     Args:
         ckpt_path: None, a file, or "last" for the last one of the newest run below `runs`.
         run: the run's own folder; if it or one of its stages has checkpoints, it was interrupted.
         runs: folder of all runs of one name.
+        say: takes the path, and warnings.
 
     Raises:
         InputError: there is no such file, or it is damaged, and so is the one before it.
@@ -46,13 +49,13 @@ def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None
         path = Path(ckpt_path)
     damage, before = _damage(path), path.with_name(PREVIOUS)
     if damage and path.name == LAST and _damage(before) is None:
-        print(f"{path} {damage}: resuming from the one before it", flush=True)
+        say(f"{path} {damage}: resuming from the one before it")
         path, damage = before, None
     if damage:
         raise InputError(
             f"ckpt_path={path} {damage}: name a .ckpt file that a run has written, or last."
         )
-    print(f"resuming from {path}", flush=True)
+    say(f"resuming from {path}")
     return path
 
 

@@ -6,6 +6,7 @@ train.py instantiates what the configuration names, fits and tests; the rest of 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ from asysplat.training.module import SplattingModule
 from asysplat.training.tensorboard import cut_events, log_choices, log_results
 
 Callbacks = Mapping[str, lightning.Callback]
+_say = rank_zero_only(partial(print, flush=True))  # one process of several speaks
 
 
 @dataclass
@@ -90,14 +92,13 @@ class TrainingStage:
             InputError: the weights do not fit the model.
         """
         load_weights(self.weights, module)
-        say = rank_zero_only(print)
-        say(f"{self.config.stage}: {describe_stage(self.config)}")
-        say(f"model: {module.net.describe()}")
+        _say(f"{self.config.stage}: {describe_stage(self.config)}")
+        _say(f"model: {module.net.describe()}")
         options = plain_options(self.config)
         module.save_hyperparameters(options, logger=False)
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
-            say(f"not as before: {difference}")
+            _say(f"not as before: {difference}")
         cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
@@ -197,7 +198,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         quiet_lightning()
         fingerprint = describe_run(config)  # now, since files may be edited during the training
         runs = Path(config.paths.logs) / config.name
-        checkpoint = find_checkpoint(config.ckpt_path, folder, runs)
+        checkpoint = find_checkpoint(config.ckpt_path, folder, runs, say=_say)
         first, results = resume_point(checkpoint, configs)
         weights = config.init_path if checkpoint is None else None
         check_start(configs[first], checkpoint, weights)

@@ -1,4 +1,4 @@
-"""Photographs of 50 megapixels in 4 GB: a scene or a sentence, no kill.
+"""Photographs of 50 megapixels, and 2,000 of them, in 4 GB: a scene or a sentence, no kill.
 
 The limit is that of a process's own data (`ulimit -d`), of which libraries take some.
 """
@@ -72,3 +72,11 @@ def test_fifty_megapixels(reconstruct, tmp_path):
     code, errors = reconstruct(tmp_path / "large", "cameras=given", "seconds=5", "height=5760")
     assert code == 1 and errors.startswith("error: there is no memory left"), errors
     assert errors.count("\n") == 1 and sorted(tmp_path.rglob("*")) == before
+
+
+def test_two_thousand_photographs(reconstruct, tmp_path):
+    write_scene(tmp_path / "many", 2000)
+    for views in (128, "null"):  # the default, and as many as 2 GB hold
+        options = ("cameras=given", "seconds=5", f"height={SIZE[0]}", f"views={views}")
+        code, errors = reconstruct(tmp_path / "many", *options)
+        assert code == 0, errors
