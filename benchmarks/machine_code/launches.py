@@ -127,7 +127,7 @@ def _plane_sweep(planes: int) -> None:
 
 def _adam() -> None:
     num, rows = 2048, []
-    for numbers in (1, 3, 4, 48):
+    for numbers in (1, 3, 4, 12, 48):
         arrays = (torch.zeros(num, numbers) for _ in range(4))
         counts = torch.zeros(num, dtype=torch.int32)
         rows.append(Rows(*arrays, counts, torch.zeros(numbers)))

@@ -81,6 +81,17 @@ def test_a_splat_is_few_instructions_of_memory_none_waiting_for_a_store(capabili
             assert accesses[first : first + step] == ["st"] * step, launch.case
 
 
+def test_no_lane_loads_a_step_of_adam_that_another_has_stored():
+    launches = without_repeats(record_launches(90), 90)
+    launches = [launch for launch in launches if launch.kernel_name == "update_rows"]
+    # Where a row has few or many numbers, its lanes load its step each for themselves.
+    assert {launch.arguments["NUMBERS"] for launch in launches} == {1, 3, 4, 12, 48}
+    for launch in launches:
+        ptx = compile_launch(launch, 90).asm["ptx"]
+        events = re.findall(r"\bld\.global|\bst\.global|\bbar\.sync", ptx)
+        assert "bar.sync" in events[: events.index("st.global")], launch.arguments["NUMBERS"]
+
+
 def test_no_lane_repeats_the_work_of_another():
     one_each = {"project", "list_tiles", "project_backward"}  # a lane for each number of a block
     launches = [launch for launch in record_launches(90) if launch.kernel_name in one_each]

@@ -9,7 +9,7 @@ from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 triton = pytest.importorskip("triton")
 
 NUM = 300
-NUMBERS = (1, 3, 4, 48)  # of a row of each tensor
+NUMBERS = (1, 3, 4, 12, 48)  # of a row of each tensor
 
 
 def make_tensors(dtype=torch.float32, device="cpu"):
@@ -22,6 +22,23 @@ def make_tensors(dtype=torch.float32, device="cpu"):
         state = (torch.zeros_like(values), torch.zeros_like(values), steps)
         rows.append(Rows(values, torch.zeros_like(values), *state, rates))
     return rows
+
+
+@pytest.mark.gpu
+def test_every_run_gives_the_same_bits():
+    from asysplat.ops.adam.cuda import adam_step_cuda
+
+    runs = []
+    for _ in range(20):
+        generator = torch.Generator().manual_seed(1)
+        rows = [each._replace(rates=10 * each.rates) for each in make_tensors(device=DEVICE)]
+        visible = torch.ones(NUM, dtype=torch.bool, device=DEVICE)
+        for _ in range(5):
+            for each in rows:
+                each.gradient.copy_(torch.randn(each.gradient.shape, generator=generator))
+            adam_step_cuda(rows, visible, AdamSettings(0.9, 0.999, 1e-15))
+        runs.append([each.parameter.clone() for each in rows])
+    assert all(torch.equal(a, b) for run in runs[1:] for a, b in zip(runs[0], run, strict=True))
 
 
 @kernel

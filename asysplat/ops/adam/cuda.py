@@ -112,6 +112,7 @@ def update_rows(
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     updated = tl.load(alive + row, mask=row < num, other=0) != 0
     step = tl.load(steps + row, mask=updated, other=0) + 1
+    tl.debug_barrier()  # lanes that share a row load its step before one of them stores it
     tl.store(steps + row, step, mask=updated)
     entry = corrections + 2 * tl.minimum(step, last_step)
     to_mean, to_root = tl.load(entry)[:, None], tl.load(entry + 1)[:, None]
