@@ -294,7 +294,7 @@ def _line(row: Result) -> str:
         return f"{row['operator']}: {row['fault']}"
     times = {name: row[name] for name in ("kernels", "torch", "library") if row[name]}
     words = [f"{name} {1e3 * time['median']:.2f} ms" for name, time in times.items()]
-    return ", ".join([f"{row['operator']}: {words[0]}", *words[1:], row["fault"]]).rstrip(", ")
+    return f"{row['operator']}: {', '.join(filter(None, [*words, row['fault']]))}"
 
 
 def _error_cell(row: Result) -> str:

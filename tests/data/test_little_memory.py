@@ -1,4 +1,4 @@
-"""Photographs of 50 megapixels, and 2,000 of them, in 4 GB: a scene or a sentence, no kill.
+"""2,000 photographs, and photographs of 50 megapixels, in 4 GB: a scene or a sentence, no kill.
 
 The limit is that of a process's own data (`ulimit -d`), of which libraries take some.
 """

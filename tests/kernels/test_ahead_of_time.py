@@ -84,7 +84,7 @@ def test_a_splat_is_few_instructions_of_memory_none_waiting_for_a_store(capabili
 def test_no_lane_loads_a_step_of_adam_that_another_has_stored():
     launches = without_repeats(record_launches(90), 90)
     launches = [launch for launch in launches if launch.kernel_name == "update_rows"]
-    # Where a row has few or many numbers, its lanes load its step each for themselves.
+    # With 12 and 48 numbers several lanes load a row's step, each for itself.
     assert {launch.arguments["NUMBERS"] for launch in launches} == {1, 3, 4, 12, 48}
     for launch in launches:
         ptx = compile_launch(launch, 90).asm["ptx"]
