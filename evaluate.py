@@ -1,4 +1,4 @@
-"""Measure a model or files of Gaussians, before and after the paper's post-optimization.
+"""Measure a model or another system, before and after the paper's post-optimization.
 
 python evaluate.py run=last
 """
@@ -24,6 +24,7 @@ from rich.progress import track
 from torch import Tensor, nn
 
 from asysplat.data.datamodule import FixedTasks, Sample
+from asysplat.data.photographs import Photographs, normalized_points
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.post_optimization import (
@@ -33,12 +34,15 @@ from asysplat.evaluation.post_optimization import (
 )
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
+from asysplat.evaluation.view_images import ViewImages, find_images, read_images
 from asysplat.export import write_safetensors
 from asysplat.export.gaussians import read_notes
 from asysplat.export.scene_folder import check_visible, find_files, world_origin
 from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
+from asysplat.refinement import AnchorScene, ScaffoldSettings, refine, refine_scaffold
+from asysplat.refinement.init import initial_gaussians
 from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
@@ -66,7 +70,7 @@ def evaluate(options: DictConfig) -> None:
     except (ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {error}") from error
     measure = make_measure(config, options, fabric.device)
-    net = load_network(config, fabric.device) if options.gaussians is None else None
+    net = load_network(config, fabric.device) if target.system is None else None
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
@@ -77,10 +81,16 @@ def evaluate(options: DictConfig) -> None:
         predictor, early_exit = make_predictor(net, fabric), net.early_exit_fractions
     else:
         tests = {data.name: data.tests[data.name]}
-        opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
-        predictor, file_results, backgrounds = opened
-        measure = replace(measure, backgrounds=backgrounds)
-        fingerprint = fingerprint | file_results
+        described = {"tested/scenes": len(tests[data.name])}
+        if target.system == "gaussians":
+            opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
+            predictor, fitted, backgrounds = opened
+            measure, described = replace(measure, backgrounds=backgrounds), described | fitted
+        elif target.system == "images":
+            predictor = open_images(Path(options.images), tests[data.name], fabric.device)
+        else:
+            predictor = make_refiner(options, measure, tests[data.name])
+        fingerprint = fingerprint | described
 
     folders = target.folder, target.scene_folder
     scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)
@@ -92,15 +102,20 @@ def evaluate(options: DictConfig) -> None:
     results = fingerprint | {"evaluation/post_optimization": POST_OPTIMIZATION_METHOD}
     results |= {f"protocol/{k}": v for k, v in measure.protocol.describe().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
-    if options.gaussians is not None:  # reading a file is no prediction
-        results = {k: v for k, v in results.items() if not k.startswith("cost/post0/")}
+    if target.system in ("gaussians", "images"):  # reading a file is no prediction
+        left_out = "cost/" if target.system == "images" else "cost/post0/"
+        results = {k: v for k, v in results.items() if not k.startswith(left_out)}
     write_csv(target.folder / "evaluation.csv", image_rows(scenes))
     write_json(target.folder / EVALUATION, results)
     print_evaluation(results, list(scenes), target.folder)
 
 
 def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
-    """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing."""
+    """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing.
+
+    Raises:
+        InputError: steps of post-optimization of images, or of Gaussians of each view.
+    """
     protocol = instantiate(config.metrics)
     lpips = load_lpips(protocol.lpips_net, Path(options.paths.weights), options.paths.download)
     if lpips is None:
@@ -109,8 +124,15 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
         lpips.to(device)
     steps = options.post_optimization_steps
     steps = tuple(steps) if isinstance(steps, ListConfig) else (steps,)
-    color = config.training.background
-    background = None if color == "inputs" else torch.tensor(color, device=device)
+    per_view = isinstance(instantiate(options.get("refinement")), ScaffoldSettings)
+    if (per_view or options.images is not None) and steps != (0,):
+        raise InputError(
+            f"post_optimization_steps={list(steps)}: images, and Gaussians that depend on the view "
+            "as Scaffold-GS's, are measured as they are: add post_optimization_steps=0."
+        )
+    color, background = config.training.background, None
+    if color != "inputs":
+        background = torch.tensor(color, dtype=torch.float32, device=device)
     return PostOptimization(steps, protocol, lpips, background)
 
 
@@ -141,9 +163,9 @@ def open_gaussians(
     """Read and check the Gaussians of every scene of the data; return what reads one again.
 
     Returns:
-        The scene's Gaussians in the frame of its sample, as a prediction; tested/scenes, their
-        number, and, if cameras were fitted, tested/residual, the largest (see `SceneFile.read`);
-        the backgrounds [3] that the files name, by scene.
+        The scene's Gaussians in the frame of its sample, as a prediction; if cameras were fitted,
+        tested/residual, the largest (see `SceneFile.read`); the backgrounds [3] that the files
+        name, by scene.
     """
     files = find_files(path, [task.sequence for task in tests.tasks])
 
@@ -158,7 +180,7 @@ def open_gaussians(
         cameras = sample["targets"].cameras.to(device)
         check_visible(gaussians, cameras, files[sample["scene"]], residual is not None)
         residuals += [] if residual is None else [residual]
-    described = {"tested/scenes": len(tests)}
+    described = {}
     if residuals:
         described["tested/residual"] = max(residuals)
         print(f"{len(residuals)} scenes fitted by cameras, residual {max(residuals):.2%} at most")
@@ -170,6 +192,66 @@ def open_gaussians(
     colors = {name: read_notes(file.path).background for name, file in files.items()}
     known = {name: torch.tensor(color, device=device) for name, color in colors.items() if color}
     return predictor, described, known
+
+
+def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predictor:
+    """Read and check the images of every scene's test views; return what reads a scene's again."""
+    paths = find_images(folder, tests.tasks)
+
+    def read(sample: Sample) -> ViewImages:
+        size = sample["targets"].images.shape[-2:]
+        return read_images(paths[sample["scene"]], *size)
+
+    for index in track(range(len(tests)), "checking scenes"):
+        read(tests[index])
+
+    def predictor(sample: Sample) -> Predict:
+        images = ViewImages(read(sample).images.to(device))
+        return lambda inputs: images
+
+    return predictor
+
+
+def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTasks) -> Predictor:
+    """Return what refines a scene on its input views, from its sparse points or a plane sweep."""
+    settings = instantiate(options.refinement)
+    function = refine_scaffold if isinstance(settings, ScaffoldSettings) else refine
+    if options.refinement_steps is None:
+        limit = {"seconds": float(options.refinement_seconds)}
+    else:
+        limit = {"steps": options.refinement_steps}
+    sequences = {task.sequence.name: task.sequence for task in tests.tasks}
+
+    def predictor(sample: Sample) -> Predict:
+        # Synthetic scenes have no sparse points.
+        points = getattr(sequences[sample["scene"]], "points", None)
+        points = normalized_points(points, sample["frame"])
+
+        def predict(inputs: Views) -> Gaussians | AnchorScene:
+            device = inputs.images.device
+            photographs = Photographs(
+                sample["scene"],
+                inputs,
+                held_out=None,
+                input_files=[],
+                held_out_files=[],
+                normalization=sample["frame"],
+                points=None if points is None else points.to(device),
+            )
+            init = "plane_sweep" if points is None else "points"
+            start = initial_gaussians(init, photographs, settings)
+            return function(
+                start,
+                inputs,
+                settings,
+                background=measure.background,
+                seed=options.seed,
+                **limit,
+            )
+
+        return predict
+
+    return predictor
 
 
 def write_predictions(

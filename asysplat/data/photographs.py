@@ -15,7 +15,7 @@ from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.selection.views import evenly_spaced
-from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
+from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
@@ -146,7 +146,7 @@ def open_photographs(
         input_files=[files[index] for index in inputs],
         held_out_files=[files[index] for index in held_out],
         normalization=normalization,
-        points=_normalized_points(scene, normalization),
+        points=normalized_points(scene.points, normalization),
         total=len(scene.images),
         origin=scene.origin,
     )
@@ -183,11 +183,11 @@ def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> Non
         )
 
 
-def _normalized_points(
-    scene: PosedScene, normalization: Normalization
+def normalized_points(
+    points: Points | None, normalization: Normalization
 ) -> Float[Tensor, "P 3"] | None:
-    if scene.points is None or not len(scene.points):
+    """Move sparse points of a scene's files to the network's frame; None if there are none."""
+    if points is None or not len(points):
         return None
-    pose = normalization.world_to_mean
-    points = torch.as_tensor(scene.points, dtype=torch.float64)
-    return ((points @ pose[:3, :3].mT + pose[:3, 3]) * normalization.scale).float()
+    pose, world = normalization.world_to_mean, torch.as_tensor(points, dtype=torch.float64)
+    return ((world @ pose[:3, :3].mT + pose[:3, 3]) * normalization.scale).float()

@@ -17,18 +17,17 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     """Draw a row of images for each target view of one scene; no field has a batch dimension.
 
     Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
-    rendered inverse depth and, if the data has depths, the true one on the same scale. Pixels that
-    a mask excludes are blank in the last three.
+    rendered inverse depth, if it is known, and, if the data has depths, the true one on the same
+    scale. Pixels that a mask excludes are blank in the last three.
     """
     images = {
         "nearest input": nearest_view_images(inputs, targets),
         "target": targets.images,
         "rendered": rendering.image,
     }
-    maps = {
-        "error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1),
-        "inverse depth": inverse_depths(rendering.depth),
-    }
+    maps = {"error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1)}
+    if rendering.depth is not None:
+        maps["inverse depth"] = inverse_depths(rendering.depth)
     if targets.depths is not None:
         maps["true inverse depth"] = inverse_depths(targets.depths)
     if targets.masks is not None:
@@ -47,8 +46,8 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
         error, *disparities = (values[view].cpu().float() for values in maps.values())
         row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
-        near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
         for axis, values in zip(row[4:], disparities, strict=True):
+            near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
             axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
         for axis in row:
             axis.set(xticks=[], yticks=[])

@@ -12,7 +12,8 @@ from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow
-from asysplat.refinement import PAPER, Refinement, RefinementProgress, refine
+from asysplat.evaluation.view_images import ViewImages
+from asysplat.refinement import PAPER, AnchorScene, Refinement, RefinementProgress, refine
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Gaussians, Views
 
@@ -22,7 +23,8 @@ POST_OPTIMIZATION_METHOD = (
     f"is at distance 1 from the middle of all) and {PAPER.rates.sh:g} of SH, 0 of the others; "
     "seconds and gb are those of the prediction and the steps together"
 )
-Predict = Callable[[Views], Gaussians]
+Scene = Gaussians | AnchorScene | ViewImages
+Predict = Callable[[Views], Scene]
 StepCallback = Callable[[int, Rendering | None], None]
 
 
@@ -51,7 +53,7 @@ class PostOptimization:
     """Runs the paper's post-optimization (Suppl. A) on scenes and measures them at given steps.
 
     The input views are rendered from the predicted Gaussians; their mean squared error optimizes
-    means and SH, all views in each step.
+    means and SH, all views in each step. Scenes of other kinds are measured as they are.
 
     Args:
         steps: after which to measure, increasing; 0: as predicted.
@@ -90,10 +92,13 @@ class PostOptimization:
 
         Args:
             scene: name of the scene.
-            predict: the input views -> [N] Gaussians in their frame.
+            predict: the input views -> [N] Gaussians, or another scene, in their frame.
             inputs, targets: the scene's views, without a batch dimension.
             watch: called after each step with the number of steps and, at the steps to measure, the
                 rendering of the targets.
+
+        Raises:
+            InputError: steps that optimize a scene that is not Gaussians.
         """
         background = self.backgrounds.get(scene, self.background)
         if background is None:
@@ -104,19 +109,20 @@ class PostOptimization:
             result.add("targets", method, rows)
         meter = CostMeter(inputs.images.device)
 
-        def measure(step: int, gaussians: Gaussians) -> None:
+        def measure(step: int, scene: Scene) -> None:
             meter.stop()
             method = f"post{step}"
             result.costs[method] = {"seconds": sum(meter.seconds)}
             if meter.gb:
                 result.costs[method]["gb"] = max(meter.gb)
-            rendering = _render(gaussians, targets, background)
+            rendering = _render(scene, targets, background)
             drawn = rendering.image, rendering.depth
             result.add("targets", method, self.protocol.measure_views(*drawn, targets, self.lpips))
-            images = _render(gaussians, inputs, background).image
-            rows = self.protocol.measure_views(images, None, inputs, None, psnr_only=True)
-            result.add("inputs", method, rows)
-            result.gaussians = gaussians.num_gaussians
+            if not isinstance(scene, ViewImages):
+                images = _render(scene, inputs, background).image
+                rows = self.protocol.measure_views(images, None, inputs, None, psnr_only=True)
+                result.add("inputs", method, rows)
+                result.gaussians = scene.num_gaussians
             watch(step, rendering)
             meter.start()
 
@@ -128,15 +134,22 @@ class PostOptimization:
             return False
 
         meter.start()
-        gaussians = predict(inputs)
+        predicted = predict(inputs)
         if 0 in self.steps:
-            measure(0, gaussians)
+            measure(0, predicted)
         steps = self.steps[-1]
         if steps > 0:
-            refine(gaussians, inputs, PAPER, steps=steps, background=background, watch=after_step)
+            if not isinstance(predicted, Gaussians):
+                raise InputError(
+                    f"post_optimization_steps={self.steps}: only Gaussians that are the same in "
+                    "every view are optimized: give post_optimization_steps=0."
+                )
+            refine(predicted, inputs, PAPER, steps=steps, background=background, watch=after_step)
         return result
 
 
 @torch.no_grad()
-def _render(gaussians: Gaussians, views: Views, background: Float[Tensor, "3"]) -> Rendering:
-    return render(gaussians, views.cameras, background, masks=views.masks)
+def _render(scene: Scene, views: Views, background: Float[Tensor, "3"]) -> Rendering:
+    if isinstance(scene, Gaussians):
+        return render(scene, views.cameras, background, masks=views.masks)
+    return scene.render(views.cameras, background, views.masks)

@@ -10,6 +10,9 @@ from asysplat.report.paper import Number, PaperRow, PaperTable
 from asysplat.runs.runs import Run
 from asysplat.runs.systems import SYSTEM, TESTED, options_of_test
 
+# Costs of refinements; other systems have none.
+COSTS = {"inference_seconds": "cost/post0/seconds", "inference_gb": "cost/post0/gb"}
+
 
 def system_rows(
     table: PaperTable, config: DictConfig, sets: Mapping[str, str], systems: Sequence[Run]
@@ -58,20 +61,19 @@ def _fill(
     unlike = ""
     for column in table.columns:
         paper_set, _, metric = column.key.partition("/")
-        if not metric:
-            continue
-        wanted = options_of_test(config, row.test_set or sets[paper_set])
+        wanted = options_of_test(config, row.test_set or sets.get(paper_set, config.data.name))
+        key = f"test/{wanted['data']}/post0/{metric}" if metric else COSTS.get(column.key)
         newest: dict[int, Run] = {}  # by seed
         for run in systems:
             of_run = {key: run.results.get(f"{TESTED}{key}", wanted[key]) for key in wanted}
             if others := [f"{k}={v} ({wanted[k]})" for k, v in of_run.items() if v != wanted[k]]:
                 unlike = f"measured with other options than the table's (in brackets): {run.folder}"
                 unlike += f" has {', '.join(others)}"
-            elif run.results.get(f"test/{wanted['data']}/post0/{metric}") is not None:
+            elif key is not None and run.results.get(key) is not None:
                 newest[run.seed] = run
         runs = [newest[seed] for seed in sorted(newest)]
         if runs:
-            values[column.key] = [r.results[f"test/{wanted['data']}/post0/{metric}"] for r in runs]
+            values[column.key] = [run.results[key] for run in runs]
         used += [run for run in runs if run not in used]
     if not used:
         return replace(row, note=unlike), []

@@ -1,21 +1,30 @@
-"""Find what evaluate.py measures: a finished run, a checkpoint or files of Gaussians."""
+"""Find what evaluate.py measures: a finished run, a checkpoint or another system's scenes."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
 from asysplat.runs.ranges import check_ranges
-from asysplat.runs.run_config import read_config
+from asysplat.runs.run_config import plain_options, read_config
 from asysplat.runs.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
-from asysplat.runs.systems import describe_system
+from asysplat.runs.systems import contents_below, describe_system
 
 CHECKPOINT = "checkpoints/last.ckpt"
+SYSTEMS = ("gaussians", "images", "refinement")  # options for scenes that no network predicts
+SOURCES = ("run", "init_path", *SYSTEMS)
 # The others are train.py's.
-OWN_OPTIONS = ("run", "gaussians", "system", "post_optimization_steps", "write_gaussians")
+OWN_OPTIONS = (
+    *("run", *SYSTEMS, "refinement_seconds", "refinement_steps"),
+    *("system", "post_optimization_steps", "write_gaussians"),
+)
+# Their PLY files have positions divided by a quantile, and opacities that are no logits.
+UNREADABLE = ("pixelsplat", "mvsplat")
 
 
 @dataclass(frozen=True)
@@ -23,6 +32,7 @@ class EvaluationTarget:
     """What an evaluation measures."""
 
     config: DictConfig  # as train.py takes it; its init_path names the weights
+    system: str | None  # the one of SYSTEMS that is given; None: a network
     folder: Path  # for the results
     fingerprint: dict[str, str | int]  # everything that the results depend on
 
@@ -36,26 +46,28 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     """Find the target of evaluate.py from its options and the overrides of its command.
 
     Raises:
-        InputError: none of run, init_path and gaussians is given, or several are; files do not
-            exist; options that do not go together; a value that is missing or out of range.
+        InputError: none of SOURCES is given, or several are; files do not exist, or are in a format
+            that loses the scene; options that do not go together; a value that is missing or out of
+            range.
     """
-    sources = [name for name in ("run", "init_path", "gaussians") if options[name] is not None]
+    sources = [name for name in SOURCES if options.get(name) is not None]
     if len(sources) != 1:
         raise InputError(
             f"{' and '.join(sources) or 'nothing'} is given to evaluate: give one of run=last, "
-            "init_path=shipped and gaussians=FOLDER."
+            "init_path=shipped, gaussians=FOLDER, images=FOLDER and refinement=3dgs."
         )
-    if options.gaussians is None and options.system is not None:
+    system = next(iter(set(sources) & set(SYSTEMS)), None)
+    if system is None and options.system is not None:
         raise InputError(
-            f"system={options.system} names the system that made gaussians=...: give both, "
-            "or neither."
+            f"system={options.system} names the system that made gaussians=..., images=... or "
+            "refinement=...: give both, or neither."
         )
     if options.write_gaussians is not None:
         _check_new(Path(options.write_gaussians), options)
     names_data = any(override.startswith("data") for override in overrides)
-    if options.gaussians is not None and not names_data:
+    if system in ("gaussians", "images") and not names_data:
         raise InputError(
-            f"gaussians={options.gaussians} is measured on photographs of the same scenes: add "
+            f"{system}={options[system]} is measured on photographs of the same scenes: add "
             "data=files data.root=my_scenes."
         )
     if options.run is not None:
@@ -63,14 +75,44 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     config = options.copy()
     with open_dict(config):
         for name in OWN_OPTIONS:
-            del config[name]
+            config.pop(name, None)
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    check_ranges(config)
+    check_ranges(options)
     fingerprint = _describe(config, options)
-    stem = Path(options.gaussians or options.init_path).stem
+    if system is None:
+        stem = Path(options.init_path).stem
+    else:
+        stem, made_of = _describe_source(system, options, overrides)
+        fingerprint |= describe_system(config, options.system or stem, made_of)
     folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(fingerprint)[:8]}"
-    return EvaluationTarget(config, folder, fingerprint)
+    return EvaluationTarget(config, system, folder, fingerprint)
+
+
+def _describe_source(
+    system: str, options: DictConfig, overrides: Sequence[str]
+) -> tuple[str, dict[str, Any]]:
+    """Return the name of another system, and what its scenes depend on."""
+    if system == "refinement":
+        (name,) = (
+            value
+            for key, _, value in (override.partition("=") for override in overrides)
+            if key.lstrip("+") == system
+        )
+        keys = ("refinement_seconds", "refinement_steps")
+        return name, plain_options(options.refinement) | {key: options[key] for key in keys}
+    path = Path(os.path.abspath(options[system]))
+    name = path.stem if path.is_file() else path.name
+    contents = contents_below(path)
+    called = str(options.system or name)
+    ply = any(file.endswith(".ply") for file in contents)
+    if system == "gaussians" and ply and called.lower() in UNREADABLE:
+        raise InputError(
+            f"gaussians={options.gaussians} of {called}: the PLY files that it writes have scaled "
+            "positions and opacities that are no logits, so that its scene is lost: give the "
+            "images that it renders of the test views, images=FOLDER."
+        )
+    return name, contents
 
 
 def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
@@ -93,7 +135,7 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
             )
     config = read_config(folder / "config.yaml")
     config.init_path = str(checkpoint)
-    return EvaluationTarget(config, folder, _describe(config, options))
+    return EvaluationTarget(config, None, folder, _describe(config, options))
 
 
 def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
@@ -101,17 +143,15 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     described = describe_run(config)
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
     described["evaluation/post_optimization_steps"] = str(options.post_optimization_steps)
-    if options.gaussians is not None:
-        described |= describe_system(config, Path(options.gaussians), options.system)
     return described
 
 
 def _check_new(folder: Path, options: DictConfig) -> None:
     """Check that there is something to write to `folder`, and nothing there yet."""
-    if options.gaussians is not None:
+    if options.run is None and options.init_path is None:
         raise InputError(
-            f"write_gaussians={folder} writes what a model predicts, and "
-            f"gaussians={options.gaussians} are files: leave one out."
+            f"write_gaussians={folder} writes what a network predicts, of run=... or "
+            "init_path=...: give one of these, or leave it out."
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(

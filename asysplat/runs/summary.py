@@ -101,8 +101,9 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
         keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
         steps = sorted({int(key[2].removeprefix("post")) for key in keys})
         metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
-        title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
-        title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
+        title = f"test scenes: {name}, metrics: {results['protocol/name']}"
+        if f"{costs}/gaussians" in results:  # none of images
+            title += f", {results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
         titles = ("steps", "seconds", "GB", "inputs (dB)", *(METRICS[m] for m in metrics))
         methods = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
         methods |= {label: (prefix.format(name), "") for label, prefix in BASELINE_ROWS.items()}

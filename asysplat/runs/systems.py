@@ -2,7 +2,6 @@
 
 import glob
 import json
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,27 +20,30 @@ IMAGES = ("inputs", "targets", "height", "width", "selection")
 IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
 
 
-def describe_system(config: DictConfig, gaussians: Path, system: str | None) -> dict[str, Any]:
-    """Describe the scenes of a system, and what they are measured on, for evaluation.json.
+def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a system, and what it is measured on, for evaluation.json.
 
     Args:
         config: configuration of train.py.
-        gaussians: a folder of files of Gaussians, or one file.
-        system: name of the system; None: that of the folder or file.
+        system: its name.
+        made_of: what its scenes depend on, such as `contents_below` their files.
     """
-    absolute = Path(os.path.abspath(gaussians))
-    name = absolute.stem if absolute.is_file() else absolute.name
-    folder, stem = gaussians, "*"
-    if gaussians.is_file():
-        folder, stem = gaussians.parent, glob.escape(gaussians.stem)
-    files = [*folder.glob(f"{stem}.*"), *folder.glob(f"{stem}/*/*/*")]  # with their cameras
-    content = {str(path.relative_to(folder)): content_of(path) for path in files if path.is_file()}
     tested = options_of_test(config, config.data.name)
     return {
-        SYSTEM: name if system is None else str(system),
-        "evaluation/gaussians": hash_of(content),
+        SYSTEM: system,
+        "evaluation/made_of": hash_of(made_of),
         **{f"{TESTED}{key}": value for key, value in tested.items()},
     }
+
+
+def contents_below(path: Path) -> dict[str, Any]:
+    """Return the content of a file, with its cameras, or of the files of a folder of scenes."""
+    folder, stem = path, "*"
+    if path.is_file():
+        folder, stem = path.parent, glob.escape(path.stem)
+    patterns = (f"{stem}.*", f"{stem}/*.*", f"{stem}/*/*/*")  # Gaussians, images, a COLMAP model
+    files = [file for pattern in patterns for file in folder.glob(pattern) if file.is_file()]
+    return {str(file.relative_to(folder)): content_of(file) for file in files}
 
 
 def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:

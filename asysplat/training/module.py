@@ -65,7 +65,7 @@ class SplattingModule(lightning.LightningModule):
         self.timer = StepTimer()  # started and stopped by a callback
         self._parallel_scenes = ParallelScenes(net, self.scene_terms, self.timer)
         self._accumulated = AccumulatedMetrics(net)
-        fixed = None if background == "inputs" else torch.tensor(background)
+        fixed = None if background == "inputs" else torch.tensor(background, dtype=torch.float32)
         self.register_buffer("background", fixed, persistent=False)
 
     def configure_model(self) -> None:

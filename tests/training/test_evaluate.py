@@ -1,4 +1,4 @@
-"""evaluate.py of a run, a checkpoint and a file: results, resumption, the report, refusals."""
+"""evaluate.py of runs, files, images and refinements: results, resumption, report, refusals."""
 
 import csv
 import json
@@ -7,17 +7,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from tiny import SIZE, VIEWS
 from tiny import STEPS as TRAINING
 from tiny_runs import COSTS, TINY_SCENES, finished
 
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation import scenes
 from asysplat.export import read_gaussians, write_gaussians
 from asysplat.geometry.motion import transform
+from asysplat.rendering import render
 from asysplat.report.fill import fill_table, finished_runs
 from asysplat.report.paper import load_paper
+from asysplat.runs.systems import find_systems
 
 pytestmark = pytest.mark.medium
 
@@ -230,6 +234,65 @@ def test_another_systems_coordinates(written, photographs, evaluate, tmp_path):
         assert found[key] == pytest.approx(expected[key], abs=1e-3)
 
 
+def test_images_measure_as_the_gaussians_that_they_show(written, photographs, evaluate, tmp_path):
+    """With 8 bits a channel, as in a file, and the same background."""
+    ours, _ = written
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "metrics=pixelsplat"]
+    data += ["post_optimization_steps=0", "training.background=[0,0,0]"]
+    _, expected = read_evaluation(evaluate(f"gaussians={ours}", *data))
+    sequence = open_scene(photographs, SceneOptions(32, 32))
+    gaussians = read_gaussians(next(ours.iterdir()), sequence.scene.origin)
+    rendered = tmp_path / "pixelSplat" / photographs.name
+    rendered.mkdir(parents=True)
+    images = render(gaussians, sequence.cameras, torch.zeros(3)).image.clamp(0, 1)
+    for index, image in enumerate(images):
+        pixels = (image * 255).floor().byte().permute(1, 2, 0).numpy()
+        Image.fromarray(pixels).save(rendered / f"{index:05d}.png")
+    folder, found = read_evaluation(evaluate(f"images={rendered.parent}", *data))
+    assert found["evaluation/system"] == "pixelSplat" and found["tested/scenes"] == 1
+    assert not [key for key in found if key.startswith(("cost", "inputs"))]
+    tested = {key: value for key, value in qualities(found).items() if key.startswith("test")}
+    assert {"test/files/post0/psnr", "test/files/post0/ssim"} <= tested.keys()
+    assert "test/files/post0/absrel" not in tested  # images have no depths
+    assert tested == pytest.approx({key: expected[key] for key in tested}, abs=0.005)
+    assert (folder / "figures" / "evaluation-post0.png").is_file()
+
+
+REFINED = [*SIZE, *VIEWS, *TINY_SCENES, "metrics=longlrm"]
+
+
+def test_3dgs_is_fitted_to_each_test_scene(evaluate, composed, tmp_path):
+    """It fills its row of Table 2, with its seconds; the same command measures the same."""
+    command = ["refinement=3dgs", "refinement_steps=40", "post_optimization_steps=0", *REFINED]
+    folder, found = read_evaluation(evaluate(*command))
+    assert found["evaluation/system"] == "3dgs" and found["tested/scenes"] == 2
+    psnr = found["test/procedural/post0/psnr"]
+    assert psnr > found["baseline/procedural/mean_color/psnr"]
+    assert found["inputs/procedural/post0/psnr"] > psnr and found["cost/post0/seconds"] > 0
+    again = evaluate(*command, f"paths.logs={tmp_path}/again")
+    assert qualities(read_evaluation(again)[1]) == qualities(found)
+
+    filled = fill_table(
+        load_paper()["state_of_the_art"],
+        [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, "stage=stage1", "earlier_stages=[]"],
+        lambda overrides: composed(*overrides, return_hydra_config=True),
+        {},
+        list(find_systems(folder)),
+    )
+    row = next(row for row in filled.rows if row.name.startswith("3DGS"))
+    assert row.values["dl3dv/psnr"] == [psnr]
+    assert row.values["inference_seconds"] == [found["cost/post0/seconds"]]
+
+
+def test_scaffold_gs_is_drawn_view_by_view(evaluate):
+    command = ["refinement=scaffold_gs", "refinement_seconds=1", *REFINED]
+    assert "add post_optimization_steps=0" in refusal(evaluate(*command))
+    _, found = read_evaluation(evaluate(*command, "post_optimization_steps=0", "system=Scaffold"))
+    assert found["evaluation/system"] == "Scaffold" and found["cost/gaussians"] > 0
+    psnr = found["test/procedural/post0/psnr"]
+    assert psnr > found["baseline/procedural/mean_color/psnr"]
+
+
 def test_files_that_do_not_fit_the_data(written, photographs, evaluate, tmp_path):
     ours, _ = written
     data = [*ON_DISK, f"data.root={photographs}", *VIEWS]
@@ -245,6 +308,15 @@ def test_files_that_do_not_fit_the_data(written, photographs, evaluate, tmp_path
     synthetic = evaluate(f"gaussians={next(ours.iterdir())}", *VIEWS, *TINY_SCENES)
     assert "is one scene, and the data has 2" in refusal(synthetic)
     assert not list(tmp_path.rglob("evaluation*.*"))
+
+
+@pytest.mark.parametrize("system", ["pixelSplat", "MVSplat"])
+def test_files_that_lose_their_scene_are_refused_by_name(evaluate, tmp_path, system):
+    (tmp_path / system).mkdir()
+    (tmp_path / system / "room.ply").touch()
+    said = refusal(evaluate(f"gaussians={tmp_path / system}", "data=files", "data.root=rooms"))
+    assert f"of {system}: the PLY files that it writes have scaled positions" in said
+    assert "images=FOLDER" in said
 
 
 def refusal(result) -> str:
@@ -265,8 +337,25 @@ REFUSED = {
     "a name of nothing": (["init_path=shipped", "system=x"], "system=x names the system that made"),
     "files to write": (
         ["gaussians=a", "data=files", "write_gaussians=b"],
-        "are files: leave one out",
+        "writes what a network predicts, of run=... or init_path=...",
     ),
+    "no images": (
+        ["images=none", "data.test_scenes=1", "post_optimization_steps=0"],
+        "images=none is no folder",
+    ),
+    "post-optimization of images": (
+        ["images=none", "data.test_scenes=1", "post_optimization_steps=3"],
+        "post_optimization_steps=[3]: images, and Gaussians that depend on the view",
+    ),
+    "a time of nothing": (
+        ["refinement=3dgs", "refinement_seconds=0"],
+        "refinement_seconds=0: give a number above 0",
+    ),
+    "half a step": (
+        ["refinement=3dgs", "refinement_steps=0.5"],
+        "refinement_steps=0.5: give a whole number of at least 1, or null",
+    ),
+    "an unknown refinement": (["refinement=nerf"], "refinement=nerf"),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],

@@ -1,0 +1,126 @@
+"""Read the images that another system rendered of the test views, in place of a scene."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from asysplat.data.images import load_image
+from asysplat.data.sequence import FileSequence
+from asysplat.data.sources import Task
+from asysplat.errors import InputError
+from asysplat.rendering import Rendering
+from asysplat.scene import Cameras
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+MAX_NAMES = 5  # names in a message
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """The rendered images of a scene's test views."""
+
+    images: Float[Tensor, "V 3 H W"]
+
+    def render(
+        self,
+        cameras: Cameras,
+        background: Float[Tensor, "3"],
+        masks: Bool[Tensor, "V H W"] | None = None,
+    ) -> Rendering:
+        """Return the images as a rendering without depths; `cameras` are those of the test."""
+        return Rendering(self.images, torch.ones_like(self.images[:, 0]), None, stats={})
+
+
+def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
+    """Find the image of every test view of every scene, by the scene's name.
+
+    Args:
+        folder: has a folder for each scene, named as the scene, with an image for each test view,
+            named as the view's photograph, or by the view's number in a scene without files. Other
+            images in it are ignored.
+        tasks: the scenes and their views.
+
+    Raises:
+        InputError: a scene or an image that is missing, twice there, or of no scene.
+    """
+    option, names = f"images={folder}", {task.sequence.name for task in tasks}
+    if not folder.is_dir():
+        raise InputError(f"{option} is no folder: name one that has a folder for each scene.")
+    folders = {path.name for path in folder.iterdir() if path.is_dir()}
+    if further := folders - names:
+        raise InputError(
+            f"{option} has {_listed(further)}, named as no scene of the data: rename or remove; "
+            f"the scenes are {_listed(names)}."
+        )
+    if missing := names - folders:
+        raise InputError(
+            f"{option} has no folder of {len(missing)} of the {len(names)} scenes, "
+            f"{_listed(missing)}: add them, or leave these scenes out of the data."
+        )
+    return {task.sequence.name: _images_of(folder / task.sequence.name, task) for task in tasks}
+
+
+def read_images(paths: Sequence[Path], height: int, width: int) -> ViewImages:
+    """Read images of `height` x `width` pixels.
+
+    Raises:
+        InputError: a damaged file, or one of another size.
+    """
+    images = []
+    for path in paths:
+        pixels = torch.tensor(load_image(path))
+        if tuple(pixels.shape[:2]) != (height, width):
+            size = "x".join(map(str, pixels.shape[:2]))
+            raise InputError(
+                f"{path} is {size} (height x width), and the test views are {height}x{width}: "
+                "render at that size, or set data.height and data.width."
+            )
+        images.append(pixels.permute(2, 0, 1).float() / 255)
+    return ViewImages(torch.stack(images))
+
+
+def view_names(task: Task) -> list[str]:
+    """Return the names of a task's test views: their photographs', or else five-digit numbers.
+
+    Raises:
+        InputError: two photographs of the scene have one name, in different folders.
+    """
+    sequence, targets = task.sequence, task.selection.targets
+    if not isinstance(sequence, FileSequence):
+        return [f"{index:05d}" for index in targets]
+    names = [PurePosixPath(str(image.file)).stem for image in sequence.scene.images]
+    counts = Counter(names)
+    twice = {names[index] for index in targets if counts[names[index]] > 1}
+    if twice:
+        raise InputError(
+            f"{sequence.name} has several photographs named {_listed(twice)}, in different "
+            "folders: rename them, so that their renderings can be told apart."
+        )
+    return [names[index] for index in targets]
+
+
+def _images_of(folder: Path, task: Task) -> list[Path]:
+    """Find the image of each test view of a scene."""
+    files: dict[str, list[Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES:
+            files.setdefault(path.stem, []).append(path)
+    names = view_names(task)
+    if missing := {name for name in names if name not in files}:
+        raise InputError(
+            f"{folder} has no image of {len(missing)} of the {len(names)} test views, "
+            f"{_listed(missing)}: add one for each, named as the view's photograph."
+        )
+    if twice := {name for name in names if len(files[name]) > 1}:
+        raise InputError(f"{folder} has several images named {_listed(twice)}: remove all but one.")
+    return [files[name][0] for name in names]
+
+
+def _listed(names: set[str]) -> str:
+    """List the first names."""
+    return ", ".join(sorted(names)[:MAX_NAMES]) + ", ..." * (len(names) > MAX_NAMES)
