@@ -38,11 +38,6 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         ),
     ),
     (
-        "a whole number of at least 1, or null for refinement_seconds",
-        lambda value: value is None or is_whole(value, 1),
-        ["refinement_steps"],
-    ),
-    (
         "a whole number of at least 1, or null for all at once",
         lambda value: value is None or is_whole(value, 1),
         ["training.views_at_once"],
@@ -59,7 +54,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
     (
         "a number above 0",
         lambda value: is_number(value) and value > 0,
-        ["width", "parameter_budget", "learning_rate", "refinement_seconds"],
+        ["width", "parameter_budget", "learning_rate"],
     ),
     (
         "a number of at least 0",
