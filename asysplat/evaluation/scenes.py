@@ -59,7 +59,7 @@ def measure_scenes(
     columns += [TimeElapsedColumn(), TimeRemainingColumn()]
     with Progress(*columns, console=make_console()) as bars:
         scenes = bars.add_task("scenes", total=sum(map(len, tests.values())))
-        steps = bars.add_task("steps", total=last)
+        steps = bars.add_task("steps", total=last, visible=last > 0)
 
         def measure_scene(name: str, index: int) -> SceneResult:
             sample = tests[name][index]
