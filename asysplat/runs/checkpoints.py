@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file
+from safetensors.torch import load
 from torch import nn
 
 from asysplat.errors import InputError
@@ -184,7 +184,8 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
         raise InputError(f"{option}={path} {damage}: copy it again, or name another file.")
     check_checkpoint(file, module)
     if file.suffix == ".safetensors":
-        weights = load_file(file)
+        # Not load_file, which leaves five objects for each tensor behind (safetensors 0.8.0).
+        weights = load(file.read_bytes())
     else:
         weights = torch.load(file, map_location="cpu", weights_only=True)["state_dict"]
     for name, tensor in weights.items():

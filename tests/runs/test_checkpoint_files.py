@@ -1,6 +1,8 @@
 """Which checkpoint a run resumes or starts from; damaged ones are detected."""
 
+import gc
 import struct
+import sys
 import zipfile
 
 import pytest
@@ -96,3 +98,16 @@ def test_weights_in_half_precision_are_loaded(tmp_path):
         assert tensor.dtype == net.state_dict()[name].dtype
     with pytest.raises(InputError, match=r"0\.bias is \(2,\) there and \(3,\) here"):
         load_weights(str(tmp_path / "net.safetensors"), torch.nn.Sequential(torch.nn.Linear(3, 3)))
+
+
+def test_loading_weights_leaves_no_objects_behind(tmp_path):
+    """Five for each tensor with safetensors.torch.load_file, version 0.8.0."""
+    module = torch.nn.Sequential(*(torch.nn.Linear(2, 2) for _ in range(50)))
+    path = tmp_path / "weights.safetensors"
+    save_file(module.state_dict(), path)
+    counts = []
+    for _ in range(30):
+        load_weights(str(path), module)
+        gc.collect()
+        counts.append(sys.getallocatedblocks())
+    assert counts[-1] - counts[9] < 20 * 50  # less than half an object for each tensor
