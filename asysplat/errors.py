@@ -1,6 +1,9 @@
 """Messages to users: the error of invalid input, and plain warnings."""
 
 import warnings
+from collections.abc import Collection
+
+MAX_NAMES = 5  # names in a message
 
 
 class InputError(ValueError):
@@ -9,6 +12,11 @@ class InputError(ValueError):
     The message is one sentence: the field or file, what was found, what is expected, and how to fix
     it. Scripts print it without a traceback.
     """
+
+
+def list_names(names: Collection[str]) -> str:
+    """List the first names in order, for a message."""
+    return ", ".join(sorted(names)[:MAX_NAMES]) + ", ..." * (len(names) > MAX_NAMES)
 
 
 def input_error_behind(error: BaseException) -> InputError | None:

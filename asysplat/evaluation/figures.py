@@ -46,8 +46,10 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
         error, *disparities = (values[view].cpu().float() for values in maps.values())
         row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
+        near = (
+            disparities[-1].flatten().nanquantile(0.99).nan_to_num().item() if disparities else 0.0
+        )
         for axis, values in zip(row[4:], disparities, strict=True):
-            near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
             axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
         for axis in row:
             axis.set(xticks=[], yticks=[])

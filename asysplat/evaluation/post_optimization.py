@@ -109,20 +109,20 @@ class PostOptimization:
             result.add("targets", method, rows)
         meter = CostMeter(inputs.images.device)
 
-        def measure(step: int, scene: Scene) -> None:
+        def measure(step: int, predicted: Scene) -> None:
             meter.stop()
             method = f"post{step}"
             result.costs[method] = {"seconds": sum(meter.seconds)}
             if meter.gb:
                 result.costs[method]["gb"] = max(meter.gb)
-            rendering = _render(scene, targets, background)
+            rendering = _render(predicted, targets, background)
             drawn = rendering.image, rendering.depth
             result.add("targets", method, self.protocol.measure_views(*drawn, targets, self.lpips))
-            if not isinstance(scene, ViewImages):
-                images = _render(scene, inputs, background).image
+            if not isinstance(predicted, ViewImages):
+                images = _render(predicted, inputs, background).image
                 rows = self.protocol.measure_views(images, None, inputs, None, psnr_only=True)
                 result.add("inputs", method, rows)
-                result.gaussians = scene.num_gaussians
+                result.gaussians = predicted.num_gaussians
             watch(step, rendering)
             meter.start()
 

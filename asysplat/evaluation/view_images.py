@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.data.images import load_image
+from asysplat.data.readers.common import images_in
 from asysplat.data.sequence import FileSequence
 from asysplat.data.sources import Task
-from asysplat.errors import InputError
+from asysplat.errors import InputError, list_names
 from asysplat.rendering import Rendering
 from asysplat.scene import Cameras
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-MAX_NAMES = 5  # names in a message
 
 
 @dataclass(frozen=True)
@@ -54,13 +52,13 @@ def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
     folders = {path.name for path in folder.iterdir() if path.is_dir()}
     if further := folders - names:
         raise InputError(
-            f"{option} has {_listed(further)}, named as no scene of the data: rename or remove; "
-            f"the scenes are {_listed(names)}."
+            f"{option} has {list_names(further)}, named as no scene of the data: rename or remove; "
+            f"the scenes are {list_names(names)}."
         )
     if missing := names - folders:
         raise InputError(
             f"{option} has no folder of {len(missing)} of the {len(names)} scenes, "
-            f"{_listed(missing)}: add them, or leave these scenes out of the data."
+            f"{list_names(missing)}: add them, or leave these scenes out of the data."
         )
     return {task.sequence.name: _images_of(folder / task.sequence.name, task) for task in tasks}
 
@@ -98,7 +96,7 @@ def view_names(task: Task) -> list[str]:
     twice = {names[index] for index in targets if counts[names[index]] > 1}
     if twice:
         raise InputError(
-            f"{sequence.name} has several photographs named {_listed(twice)}, in different "
+            f"{sequence.name} has several photographs named {list_names(twice)}, in different "
             "folders: rename them, so that their renderings can be told apart."
         )
     return [names[index] for index in targets]
@@ -107,20 +105,16 @@ def view_names(task: Task) -> list[str]:
 def _images_of(folder: Path, task: Task) -> list[Path]:
     """Find the image of each test view of a scene."""
     files: dict[str, list[Path]] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES:
-            files.setdefault(path.stem, []).append(path)
+    for path in images_in(folder):
+        files.setdefault(path.stem, []).append(path)
     names = view_names(task)
     if missing := {name for name in names if name not in files}:
         raise InputError(
             f"{folder} has no image of {len(missing)} of the {len(names)} test views, "
-            f"{_listed(missing)}: add one for each, named as the view's photograph."
+            f"{list_names(missing)}: add one for each, named as the view's photograph."
         )
     if twice := {name for name in names if len(files[name]) > 1}:
-        raise InputError(f"{folder} has several images named {_listed(twice)}: remove all but one.")
+        raise InputError(
+            f"{folder} has several images named {list_names(twice)}: remove all but one."
+        )
     return [files[name][0] for name in names]
-
-
-def _listed(names: set[str]) -> str:
-    """List the first names."""
-    return ", ".join(sorted(names)[:MAX_NAMES]) + ", ..." * (len(names) > MAX_NAMES)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from asysplat.data.readers import colmap, transforms
 from asysplat.data.sequence import MIN_EXTENT, FileSequence, ImageSequence
-from asysplat.errors import InputError
+from asysplat.errors import InputError, list_names
 from asysplat.export.gaussians import READERS, read_gaussians
 from asysplat.geometry.motion import fit_similarity, transform
 from asysplat.rendering import render
@@ -22,7 +22,6 @@ from asysplat.scene import Cameras, Gaussians
 CAMERAS = ".cameras.json"  # suffix of <scene>.cameras.json beside <scene>.ply, a transforms.json
 MODEL = "sparse/0"  # COLMAP model in the folder <scene>/, in place of <scene>.cameras.json
 MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a fraction of their spread
-MAX_NAMES = 5  # scene names of the data in a message
 # A view shows nothing if it has Gaussians in a smaller fraction of its pixels, at a height and
 # width of COVERAGE_SIZE; half of the views must show something.
 MIN_COVERAGE, COVERAGE_SIZE = 0.01, 64
@@ -113,7 +112,7 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
     """
     option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds = f"{', '.join(READERS)}"
-    listed = ", ".join(sorted(data)[:MAX_NAMES]) + ", ..." * (len(data) > MAX_NAMES)
+    listed = list_names(data)
     if scenes.is_file():
         if len(data) != 1:
             raise InputError(

@@ -38,7 +38,7 @@ def rendered(task, tmp_path) -> Path:
 
 
 def test_images_are_found_by_the_names_of_the_photographs(task, rendered):
-    (rendered / "room" / "cameras.json").touch()  # of no image, and ignored
+    (rendered / "room" / "cameras.json").touch()  # files that are no images are ignored
     found = find_images(rendered, [task])
     assert [path.name for path in found["room"]] == ["00001.png", "00004.png"]
     images = read_images(found["room"], *SIZE)

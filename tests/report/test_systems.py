@@ -94,7 +94,7 @@ def test_evaluations_on_several_sets_make_a_row(compose, write, tmp_path):
     write("3DGS", 20.0, *options, "data=mipnerf360", "data.root=/a/360_v2")
     _, rows = fill(compose, tmp_path, "state_of_the_art", "data=dl3dv")
     row = rows["3DGS, 30k steps"]
-    assert row.values.pop("inference_seconds") == [7.0]  # of DL3DV, as the paper's
+    assert row.values.pop("inference_seconds") == [7.0]  # seconds are those on DL3DV
     assert row.values == {"dl3dv/psnr": [21.0], "mipnerf360/psnr": [20.0]}
     assert "12 scenes of dl3dv data" in row.note and "12 scenes of mipnerf360 data" in row.note
 
