@@ -1,15 +1,19 @@
-"""Writing that loses nothing: atomic writes, folders of their own, space that is checked before."""
+"""Reading that ends, and writing that loses nothing: bounded text, atomic writes, own folders."""
 
 import errno
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from asysplat.errors import InputError
+
+MAX_TEXT = 2**28  # bytes of a text file; the poses of 100,000 photographs take a tenth
 
 
 @contextmanager
@@ -76,6 +80,43 @@ def check_regular(path: str | Path) -> None:
     """
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise InputError(f"{path} is a pipe or a device: put a file in its place.")
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT) -> str:
+    """Read UTF-8 text, with or without a byte order mark.
+
+    Raises:
+        InputError: a pipe, a device, a file of more than `max_bytes`, or one without permission.
+    """
+    check_regular(path)
+    try:
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise InputError(
+                f"{path} has {size:,} bytes where at most {max_bytes:,} are expected: write it "
+                "again."
+            )
+        return path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): write it again.") from error
+
+
+def read_json(path: Path, max_bytes: int = MAX_TEXT) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        InputError: the file is missing, empty, too large or no JSON; see `read_text`.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist: put it there, or name another file.")
+    text = read_text(path, max_bytes)
+    if not text.strip():
+        raise InputError(f"{path} is empty: write it again.")
+    try:
+        return json.loads(text)
+    # Also numbers of too many digits and nesting that is too deep.
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON ({error}): repair or write it again.") from error
 
 
 def refuse_links(folder: Path) -> None:

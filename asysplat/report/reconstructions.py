@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.files import read_text
 from asysplat.runs.run_config import flat_options, read_config
 from asysplat.runs.runs import RECONSTRUCTION, RESULTS
 from asysplat.runs.summary import RECONSTRUCTION_ROWS
@@ -77,11 +78,7 @@ def _read_results(path: Path) -> dict[str, int | float | None]:
         raise ValueError(f"it has the number {constant}")
 
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-        results = json.loads(content, parse_constant=refuse)
+        results = json.loads(read_text(path, MAX_BYTES), parse_constant=refuse)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error}): copy the run again.") from error
     if not isinstance(results, dict):

@@ -1,5 +1,6 @@
 """Read the configuration of a run, which may come from another machine and must not run code."""
 
+import io
 import re
 from collections.abc import Mapping
 from functools import cache
@@ -11,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from asysplat.errors import InputError
-from asysplat.files import check_regular
+from asysplat.files import read_text
 from asysplat.root import CONF
 from asysplat.runs.old_names import upgrade_config
 
@@ -28,15 +29,12 @@ def read_config(path: Path) -> DictConfig:
         InputError: the file cannot be read, has a `_target_` that no file of conf/ has, values
             without names, or an interpolation, which could hide any.
     """
-    check_regular(path)
+    text = read_text(path, MAX_BYTES)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-        text = path.read_text()
         # Without anchors, whose aliases repeat them, the bytes bound the values.
         if "&" in text and _count_nodes(yaml.compose(text, yaml.SafeLoader), {}) > MAX_NODES:
             raise ValueError(f"its aliases make more than {MAX_NODES:,} values")
-        content = OmegaConf.to_container(OmegaConf.load(path))
+        content = OmegaConf.to_container(OmegaConf.load(io.StringIO(text)))
     # ValueError: also an integer of thousands of digits, or text that is not UTF-8.
     except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = str(error).split("\n")[0]

@@ -17,6 +17,7 @@ from omegaconf import MISSING, DictConfig, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.errors import InputError
+from asysplat.files import read_json
 from asysplat.runs.checkpoints import weights_file
 from asysplat.runs.old_names import FORMAT, upgrade_results
 from asysplat.runs.revision import revision
@@ -175,12 +176,12 @@ def find_runs(logs: Path) -> Iterator[Run]:
         if any((path.parent / name).exists() for name in RECONSTRUCTION):
             continue
         try:
-            results = json.loads(path.read_text())
+            results = read_json(path)
             hash_now = _config_hash_now(path.parent, results)
             seed, commit = results["run/seed"], results["run/revision"]
             extra = path.with_name(EVALUATION)
             if extra.exists():
-                results.update(json.loads(extra.read_text()))
+                results.update(read_json(extra))
         except (ValueError, KeyError, TypeError):
             warnings.warn(
                 f"{path} is not the results of a finished run: it is left out.", stacklevel=2

@@ -1,7 +1,6 @@
 """Evaluations of other systems' scenes: what they were measured on, and where they are on disk."""
 
 import glob
-import json
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
+from asysplat.files import read_json
 from asysplat.runs.old_names import upgrade_results
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import EVALUATION, Run, content_of, files_below, hash_of, name_of
@@ -70,7 +70,7 @@ def find_systems(logs: Path) -> Iterator[Run]:
     """Yield every finished evaluation of another system below `logs`, oldest first."""
     for path in files_below(logs, EVALUATION):
         try:
-            results: Mapping[str, Any] = json.loads(path.read_text())
+            results: Mapping[str, Any] = read_json(path)
             if SYSTEM not in results:
                 continue
             described = (

@@ -64,7 +64,7 @@ BOMB = "a0: &a0 [1, 2]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for 
 HUGE = {
     "aliases": (BOMB, "aliases make more than 100,000 values"),
     "itself": ("a: &a [1, *a]", "aliases make more than 100,000 values"),
-    "bytes": ("a: " + "1" * 2**20, "more than 1,048,576 bytes"),
+    "bytes": ("a: " + "1" * 2**20, "at most 1,048,576 are expected"),
     "digits": ("a: " + "1" * 5000, "digits"),
     "depth": ("[" * 5000, "cannot be read"),
 }

@@ -3,6 +3,7 @@
 https://colmap.github.io/format.html
 """
 
+import mmap
 import re
 import struct
 import warnings
@@ -14,7 +15,10 @@ import pycolmap
 from asysplat.errors import InputError
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+FILES = ("cameras", "images", "points3D", "rigs", "frames")
+MAX_CAMERA = 24 + 8 * 16  # bytes of a camera in binary, with the parameters of the largest model
 POINT_FIELDS = 8  # fields of a line of points3D.txt before its track
+MAX_LINE = 2**26  # bytes of a line of text: a photograph with two million matches
 
 
 def read_model(model: Path) -> pycolmap.Reconstruction:
@@ -24,7 +28,10 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
         InputError: files that are missing, cut short or damaged, or an unknown camera model.
     """
     binary = (model / "cameras.bin").is_file()
-    entries = {file: _entries(file) for file in model.glob("*.bin")} if binary else {}
+    files = _files(model, ".bin" if binary else ".txt")
+    entries = {file: _entries(file) for file in files} if binary else {}
+    for file in () if binary else files:
+        check_lines(file)
     try:
         colmap = _read(model, binary)
     # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
@@ -37,7 +44,7 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
             ) from error
         try:
             with TemporaryDirectory() as folder:
-                _write_without_tracks(model, Path(folder), entries)
+                _write_without_tracks(files, Path(folder), entries)
                 colmap = _read(Path(folder), binary)
         except Exception:
             raise InputError(
@@ -64,6 +71,25 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
     return colmap
 
 
+def _files(model: Path, suffix: str) -> list[Path]:
+    return [file for name in FILES if (file := model / f"{name}{suffix}").exists()]
+
+
+def check_lines(file: Path) -> None:
+    """Check that a text has no line so long that it is none of COLMAP's, which is read whole.
+
+    Raises:
+        InputError: a part of MAX_LINE bytes has no end of a line.
+    """
+    with file.open("rb") as parts:
+        while part := parts.read(MAX_LINE):
+            if len(part) == MAX_LINE and b"\n" not in part:
+                raise InputError(
+                    f"{file} has a line of over {MAX_LINE:,} bytes: it is damaged, so copy it "
+                    "again."
+                )
+
+
 def _read(model: Path, binary: bool) -> pycolmap.Reconstruction:
     colmap = pycolmap.Reconstruction()
     (colmap.read_binary if binary else colmap.read_text)(model)
@@ -80,13 +106,15 @@ def _entries(file: Path) -> list[tuple[int, int]]:
     Raises:
         InputError: the counts in the file disagree with its length.
     """
-    stored, entries, end = file.read_bytes(), [], 8
+    entries, end = [], 8
 
     def number(kind: str, at: int) -> int:
         return struct.unpack_from(kind, stored, at)[0]
 
     def image(start: int) -> tuple[int, int]:
-        fixed = stored.index(b"\0", start + 64) + 1  # after numbers and the name
+        fixed = stored.find(b"\0", start + 64) + 1  # after numbers and the name
+        if fixed == 0:
+            raise ValueError("a name has no end")
         return fixed, fixed + 8 + 24 * number("<Q", fixed)
 
     def point(start: int) -> tuple[int, int]:
@@ -104,30 +132,36 @@ def _entries(file: Path) -> list[tuple[int, int]]:
         return end, end
 
     kinds = {"images.bin": image, "points3D.bin": point, "rigs.bin": rig, "frames.bin": frame}
+    size = file.stat().st_size
     try:
-        count = number("<Q", 0)
-        if 8 * count > len(stored):
-            raise ValueError(f"its header gives {count} entries")
-        if kind := kinds.get(file.name):
-            for _ in range(count):
-                start = end
-                fixed, end = kind(start)
-                entries.append((start, fixed))
-        if end > len(stored):
-            raise ValueError(f"its entries take {end} bytes")
+        # Only what is asked for is read, however large the file.
+        with (
+            file.open("rb") as opened,
+            mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as stored,
+        ):
+            count = number("<Q", 0)
+            kind = kinds.get(file.name)  # none for cameras, whose size follows from their model
+            if 8 * count > size or (kind is None and size > 8 + MAX_CAMERA * count):
+                raise ValueError(f"its header gives {count} entries")
+            if kind:
+                for _ in range(count):
+                    start = end
+                    fixed, end = kind(start)
+                    entries.append((start, fixed))
+                if end != size:
+                    raise ValueError(f"its entries take {end} bytes")
     except (struct.error, ValueError, OverflowError) as error:
         raise InputError(
-            f"{file} has {len(stored)} bytes, but {error}: it is cut short or damaged, so copy it "
-            "again."
+            f"{file} has {size} bytes, but {error}: it is cut short or damaged, so copy it again."
         ) from error
     return entries
 
 
 def _write_without_tracks(
-    model: Path, folder: Path, entries: dict[Path, list[tuple[int, int]]]
+    files: list[Path], folder: Path, entries: dict[Path, list[tuple[int, int]]]
 ) -> None:
-    """Copy a model without the matches of its images and the tracks of its points."""
-    for file in model.glob("*.bin" if entries else "*.txt"):
+    """Copy the files of a model without the matches of its images and the tracks of its points."""
+    for file in files:
         if file.name in ("images.bin", "points3D.bin"):
             stored, empty = file.read_bytes(), bytes(8)
             parts = [stored[start:end] + empty for start, end in entries[file]]

@@ -1,10 +1,9 @@
-"""Functions that several readers share: folders, JSON, intrinsics and poses, each checked.
+"""Functions that several readers share: folders, frames, intrinsics and poses, each checked.
 
 `size` is always (width, height) of an image, `where` the file and the image, for messages. Whatever
 does not pass a check raises an InputError.
 """
 
-import json
 import os
 import re
 from dataclasses import replace
@@ -17,6 +16,7 @@ from numpy import ndarray
 
 from asysplat.data.images import HEIF, Lens, image_size, same_proportions
 from asysplat.errors import InputError
+from asysplat.files import read_json
 from asysplat.scene import ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
@@ -53,29 +53,6 @@ def natural_order(path: Path) -> list[str | tuple[int, str]]:
     keys: list[str | tuple[int, str]] = [*parts]
     keys[1::2] = [(len(number), number) for number in numbers]
     return keys
-
-
-def read_text(file: Path) -> str:
-    """Read UTF-8 text, with or without a byte order mark."""
-    return file.read_text(encoding="utf-8-sig", errors="replace")
-
-
-def read_json(file: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: the file is missing, empty or no JSON.
-    """
-    if not file.is_file():
-        raise InputError(f"{file} does not exist: put it there, or name another file.")
-    text = read_text(file)
-    if not text.strip():
-        raise InputError(f"{file} is empty: write it again.")
-    try:
-        return json.loads(text)
-    # Also numbers of too many digits and nesting that is too deep.
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
 
 
 def read_frames(file: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from asysplat.data.readers import common
 from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import read_text
 
 CAMERAS = "opencv_cameras.json"
 
@@ -26,10 +27,10 @@ def find_scenes(root: Path) -> list[Path]:
     if not root.is_file():
         return common.folders_with(root, CAMERAS)
     if root.suffix == ".txt":
-        lines = [line.strip() for line in common.read_text(root).splitlines() if line.strip()]
+        lines = [line.strip() for line in read_text(root).splitlines() if line.strip()]
         files = [root.parent / line for line in lines]
         return files if all(file.suffix == ".json" for file in files) else []
-    return [root] if root.suffix == ".json" and '"w2c"' in common.read_text(root) else []
+    return [root] if root.suffix == ".json" and '"w2c"' in read_text(root) else []
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:

@@ -23,6 +23,7 @@ from asysplat.data.readers.common import (
 )
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import read_text
 
 POSES = ("poses_refined.txt", "poses.txt")  # the first file that exists is read
 
@@ -81,7 +82,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
 def _read_numbers(file: Path, columns: int) -> Float[ndarray, "rows columns"]:
     try:
-        lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
+        lines = [line.split() for line in read_text(file).splitlines()]
         rows = [[float(number) for number in line] for line in lines if line]
     except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read as numbers ({error}): write it again.") from error

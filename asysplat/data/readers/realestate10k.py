@@ -20,9 +20,10 @@ from torch import Tensor
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import EncodedImage, Lens, image_size
-from asysplat.data.readers.common import check_rigid, invert_pose, read_json
+from asysplat.data.readers.common import check_rigid, invert_pose
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import read_json
 
 CHUNK = ".torch"
 NUMBERS = 18  # for one camera

@@ -16,10 +16,10 @@ from asysplat.data.readers.common import (
     check_rigid,
     folders_with,
     number,
-    read_json,
 )
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.files import read_json, read_text
 
 TRAJECTORY = "traj.txt"
 PARAMETERS = "cam_params.json"
@@ -56,7 +56,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     trajectory, results = scene / TRAJECTORY, scene / "results"
     if not trajectory.is_file():
         raise InputError(f"{trajectory} does not exist: name a room's folder.")
-    rows = trajectory.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    rows = read_text(trajectory).strip().splitlines()
     count = len(list(results.glob("frame*.jpg")))
     if count > len(rows):
         raise InputError(

@@ -28,10 +28,11 @@ import numpy as np
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
+from asysplat.data.readers.colmap_model import check_lines
 from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import has_file
+from asysplat.files import has_file, read_json
 
 EXTRACT = (
     "extract rgb.mkv (or rgb.mp4) with the toolkit's iphone.prepare_iphone_data, or with "
@@ -155,7 +156,7 @@ def _arkit(
     file: Path, folder: Path, images: str, masks: str, depths: str, bad: BadImages
 ) -> list[PosedImage]:
     """Read ARKit's poses, by image: camera-to-world with OpenCV axes and intrinsics in pixels."""
-    content = common.read_json(file)
+    content = read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
     mask_folder, depth_folder = (
@@ -190,6 +191,7 @@ def _points(file: Path) -> Points | None:
     """Read columns 2 to 4 of COLMAP's points3D.txt, https://colmap.github.io/format.html."""
     if not file.is_file():
         return None
+    check_lines(file)
     with file.open(encoding="utf-8", errors="replace") as lines:
         rows = [line.split(maxsplit=4)[1:4] for line in lines if line[:1] not in ("#", "\n")]
     try:

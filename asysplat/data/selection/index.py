@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from asysplat.data.readers.common import folders_with, read_frames, read_json
+from asysplat.data.readers.common import folders_with, read_frames
 from asysplat.data.selection.views import Selection
 from asysplat.errors import InputError
+from asysplat.files import read_json
 
 LONG_LRM_FILE = "opencv_cameras.json"
 LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")

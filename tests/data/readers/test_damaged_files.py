@@ -1,34 +1,45 @@
 """Mutants of every file that is read: a sentence or numbers that can be used, and at once.
 
-pytest -m slow -k damaged runs 10,000 of them.
+pytest tests/data/readers -m slow -k damaged -s runs 10,000 of them and prints what became of them.
 """
 
 import os
 import random
+import re
 import time
 import traceback
 import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from hydra.utils import instantiate
+from layouts import colmap
 from omegaconf import OmegaConf
 from PIL import Image
+from test_colmap import as_binary
 from test_layouts import NAMES
-from torch import nn
+from torch import Tensor, nn
 
 from asysplat import load, read_gaussians, write_gaussians
 from asysplat.data import SceneOptions, open_scene
 from asysplat.data.images import load_image
 from asysplat.errors import InputError
+from asysplat.export.gaussians import Notes
+from asysplat.scene import Gaussians, Views
 
+BINARY = "colmap, binary"
 SECONDS = 5.0
 FEW = 24  # mutants of each kind in the fast test
 MANY = 1500
-ENDLESS = (os.mkfifo, lambda path: path.symlink_to("/dev/zero"))
+NUMBER = re.compile(rb"-?\d+\.?\d*(?:e[-+]?\d+)?")
+NUMBERS = (b"nan", b"-inf", b"1e999", b"1e300", b"-1", b"0", b"9" * 5000, b"1e-320", b"2147483648")
 BYTES = (
     b"\x00",
     b"\xff" * 8,
@@ -46,96 +57,219 @@ BYTES = (
 
 
 def mutate(stored: bytes, numbers: random.Random) -> bytes:
-    """Change, insert, repeat or cut bytes."""
+    """Change, insert, repeat or cut bytes, or replace a number that is written in digits."""
     start = numbers.randrange(len(stored) + 1)
     if numbers.random() < 0.3:  # where headers are
         start = numbers.randrange(min(len(stored), 200) + 1)
     end = min(len(stored), start + numbers.choice((0, 1, 2, 8, 100)))
-    way = numbers.randrange(4)
+    way = numbers.randrange(5)
     if way == 0:
         return stored[:start]
     if way == 1:
         return stored[:start] + numbers.choice(BYTES) + stored[end:]
     if way == 2:
         return stored[:start] + numbers.randbytes(end - start) + stored[end:]
+    if way == 3 and (number := NUMBER.search(stored, start)):
+        return stored[: number.start()] + numbers.choice(NUMBERS) + stored[number.end() :]
     return stored[:end] + stored[start:]
 
 
-def attack(file: Path, read, count: int, seed: str) -> list[str]:
-    """Read mutants of a file, and what has no end in its place; return what went wrong."""
-    stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
-    for index in range(count + len(ENDLESS)):
-        if index < count:
-            file.write_bytes(mutate(stored, numbers))
-        else:
-            file.unlink()
-            ENDLESS[index - count](file)
-        started = time.monotonic()
+def hostile_values(folder: Path) -> tuple[object, ...]:
+    """What has no place in a run's configuration: aliases, other classes, a user's folder."""
+    bomb: list = [1, 2]
+    for _ in range(40):
+        bomb = [bomb, bomb]
+    endless: list = [1]
+    endless.append(endless)
+    cache = {"_target_": "asysplat.data.ImageCache", "folder": str(folder), "disk_gb": 0}
+    vgg16 = {"_target_": "asysplat.training.losses.perceptual.vgg16", "download": True}
+    remove = {"_target_": "shutil.rmtree", "_args_": [str(folder)]}
+    numbers = (float("nan"), float("inf"), 0, -1, 10**30, 1e300, True, None, "", [], {})
+    return bomb, endless, cache, vgg16, remove, str(folder), "${oc.env:HOME}", *numbers
+
+
+def mutate_yaml(stored: bytes, numbers: random.Random, values: Sequence[object]) -> bytes:
+    """Change bytes, or one of the values."""
+    if numbers.random() < 0.5:
+        return mutate(stored, numbers)
+    content = yaml.safe_load(stored)
+    places = [(content, key) for key in content]
+    for parent, key in places:  # grows as it goes
+        value = parent[key]
+        if isinstance(value, dict | list):
+            keys = value if isinstance(value, dict) else range(len(value))
+            places += [(value, inner) for inner in keys]
+    parent, key = numbers.choice(places)
+    parent[key] = numbers.choice(values)
+    return yaml.safe_dump(content).encode()
+
+
+Result = Views | Gaussians | Tensor | None
+
+
+class Attack:
+    """Mutants that are read, in a folder beside another that must stay as it is."""
+
+    def __init__(self, outside: Path) -> None:
+        self.outside, self.counts = outside, Counter()
+        (outside / "folder").mkdir()
+        (outside / "notes.txt").write_text("mine")
+        np.save(outside / "folder" / "mine.npy", np.zeros(3))
+        self.mine = self._contents()
+
+    def __call__(
+        self,
+        file: Path,
+        read: Callable[[], Result],
+        count: int,
+        seed: str,
+        change: Callable[[bytes, random.Random], bytes] = mutate,
+    ) -> list[str]:
+        """Read mutants of a file, and other things in its place; return what went wrong."""
+        stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
+        others = self._others(file)
+        for index in range(count + len(others)):
+            remove(file)
+            if index < count:
+                file.write_bytes(change(stored, numbers))
+            else:
+                others[index - count](file)
+            wrong += [f"{file.name} {index}: {what}" for what in self._read(read)]
+        remove(file)
+        file.write_bytes(stored)
+        return wrong
+
+    def summary(self) -> str:
+        """Return the counts in a line."""
+        counts = self.counts
+        return (
+            f"{counts['read'] + counts['refused'] + counts['traces']:,} mutants: "
+            f"{counts['read']:,} read, {counts['refused']:,} refused in a sentence, "
+            f"{counts['traces']} traces, {counts['slow']} over {SECONDS:g} s, "
+            f"{counts['outside']} written outside, {counts['not usable']} not usable"
+        )
+
+    def _read(self, read: Callable[[], Result]) -> list[str]:
+        started, wrong = time.monotonic(), {}
         try:
-            read()
+            result = read()
+            self.counts["read"] += 1
+            wrong |= unusable(result)
         except InputError:
-            pass
+            self.counts["refused"] += 1
         except Exception as error:
             trace = traceback.extract_tb(error.__traceback__)[-1]
-            wrong.append(f"{file.name} {index}: {error!r:.200} at {trace.filename}:{trace.lineno}")
+            wrong["traces"] = f"{error!r:.200} at {trace.filename}:{trace.lineno}"
         if time.monotonic() - started > SECONDS:
-            wrong.append(f"{file.name} {index}: {time.monotonic() - started:.1f} s")
-    file.unlink()
-    file.write_bytes(stored)
-    return wrong
+            wrong["slow"] = f"{time.monotonic() - started:.1f} s"
+        if self._contents() != self.mine:
+            wrong["outside"] = "the other folder has changed"
+        self.counts.update(wrong.keys())
+        return [*wrong.values()]
+
+    def _others(self, file: Path) -> list[Callable[[Path], object]]:
+        """Return what makes a pipe, a device, a link, a folder or a file without data."""
+        targets = "/dev/zero", self.outside / "notes.txt", self.outside / "folder", "missing"
+        links = [lambda path, target=target: path.symlink_to(target) for target in targets]
+        # Where every 32 bytes are a Gaussian, they are no damage.
+        sizes = [] if file.suffix == ".splat" else [sparse]
+        return [os.mkfifo, *links, Path.mkdir, *sizes]
+
+    def _contents(self) -> dict[Path, bytes | None]:
+        paths = sorted(self.outside.rglob("*"))
+        return {path: path.read_bytes() if path.is_file() else None for path in paths}
 
 
-def attack_scene(layout: str, views, folder: Path, count: int) -> list[str]:
-    root, wrong = import_module(f"layouts.{layout}").write(views, folder), []
+def unusable(result: Result) -> dict[str, str]:
+    """Return what is wrong with numbers that were read."""
+    if result is None:
+        return {}
+    try:
+        if isinstance(result, Tensor) and not result.isfinite().all():
+            raise InputError("numbers that are not finite")
+        if not isinstance(result, Tensor):
+            result.validate()
+    except InputError as error:
+        return {"not usable": str(error)}
+    return {}
 
-    def read() -> None:
+
+def remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink()
+
+
+def sparse(path: Path) -> None:
+    """Make a file of 6 GB that takes no room."""
+    path.touch()
+    os.truncate(path, 6 * 10**9)
+
+
+@pytest.fixture(scope="module")
+def attack(tmp_path_factory):
+    attack = Attack(tmp_path_factory.mktemp("outside"))
+    yield attack
+    print(f"\n{attack.summary()}")
+
+
+def attack_scene(attack: Attack, layout: str, views, folder: Path, count: int) -> list[str]:
+    """Read mutants of each file of a scene, one image of each kind."""
+    if layout == BINARY:
+        root = as_binary(colmap.write(views, folder))
+    else:
+        root = import_module(f"layouts.{layout}").write(views, folder)
+
+    def read() -> Views:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             sequence = open_scene(root, SceneOptions(24, 32))
-            sequence.views(range(2)).validate()
-            points = sequence.points
-            assert points is None or torch.as_tensor(points).isfinite().all()
+            found, points = sequence.views(range(2)), sequence.points
+        assert points is None or torch.as_tensor(points).isfinite().all()
+        return found
 
-    files = sorted(path for path in Path(folder).rglob("*") if path.is_file())
-    kinds = {path.suffix: path for path in files}  # one image of many
-    for file in {path for path in files if path.suffix not in (".png", ".jpg")} | {*kinds.values()}:
-        wrong += attack(file, read, max(1, count // len(files)), f"{layout}{file.name}")
-    return wrong
+    paths = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+    images = {path.suffix: path for path in paths if path.suffix in (".png", ".jpg")}
+    files = [path for path in paths if path.suffix not in images] + [*images.values()]
+    share = max(1, count // len(files))
+    return [line for file in files for line in attack(file, read, share, f"{layout}{file.name}")]
 
 
 many_mutants = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
 
 
 @many_mutants
-@pytest.mark.parametrize("layout", NAMES)
-def test_damaged_scenes_are_refused_or_usable(layout, few, tmp_path, count):
-    assert attack_scene(layout, few, tmp_path / "scene", count) == []
+@pytest.mark.parametrize("layout", [*NAMES, BINARY])
+def test_damaged_scenes_are_refused_or_usable(attack, layout, few, tmp_path, count):
+    assert attack_scene(attack, layout, few, tmp_path / "scene", count) == []
 
 
 @many_mutants
 @pytest.mark.parametrize("suffix", [".ply", ".splat", ".safetensors"])
-def test_damaged_gaussians_are_refused_or_usable(suffix, make_scene, tmp_path, count):
+def test_damaged_gaussians_are_refused_or_usable(attack, suffix, make_scene, tmp_path, count):
     file = tmp_path / f"scene{suffix}"
     if suffix == ".splat":
         file.write_bytes(random.Random(0).randbytes(32 * 20))
     else:
-        write_gaussians(file, make_scene(count=20, degree=1, dtype=torch.float32)[0])
-    assert attack(file, lambda: read_gaussians(file).validate(), count, suffix) == []
+        scene, _ = make_scene(count=20, degree=1, dtype=torch.float32)
+        write_gaussians(file, scene, Notes((1e6, 2.0, 3.0), (0.25, 0.5, 0.75)))
+    assert attack(file, lambda: read_gaussians(file, (0.0, 0.0, 0.0)), count, suffix) == []
 
 
 @many_mutants
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_damaged_images_are_refused_or_usable(suffix, tmp_path, count):
+def test_damaged_images_are_refused_or_usable(attack, suffix, tmp_path, count):
     file = tmp_path / f"image{suffix}"
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(file)
-    assert attack(file, lambda: load_image(file), count, suffix) == []
+    assert attack(file, lambda: torch.from_numpy(load_image(file)), count, suffix) == []
 
 
 @pytest.mark.medium
 @many_mutants
-def test_damaged_runs_are_refused_or_usable(composed, tmp_path, count):
-    """Mutants of the checkpoint and the configuration of a run."""
+def test_damaged_runs_are_refused_or_usable(attack, composed, few, tmp_path, count):
+    """Mutants of the checkpoint and the configuration of a run, which is loaded and called."""
     sizes = ["model=asysplat_4m4s", "model.layers=1m1s", "width=0.0625", "state_size=4"]
     model = OmegaConf.to_container(composed(*sizes).model, resolve=True)
     checkpoint, config = tmp_path / "checkpoints/last.ckpt", tmp_path / "config.yaml"
@@ -143,8 +277,15 @@ def test_damaged_runs_are_refused_or_usable(composed, tmp_path, count):
     OmegaConf.save({"model": model}, config)
     weights = nn.ModuleDict({"net": instantiate(model)}).state_dict()
     torch.save({"state_dict": weights}, checkpoint)
-    for file in (checkpoint, config):
-        assert attack(file, lambda: load(str(checkpoint)), count // 2, file.name) == []
+    views, values = few.resized(32, 32), hostile_values(attack.outside / "folder")
+
+    def read() -> Gaussians:
+        with torch.inference_mode():
+            return load(str(checkpoint))(views)
+
+    assert attack(checkpoint, read, count // 2, "checkpoint") == []
+    change = partial(mutate_yaml, values=values)
+    assert attack(config, read, count // 2, "config", change) == []
 
 
 @pytest.mark.parametrize("kind", ["a link to itself", "a link to its folder", "60000 x 1 pixels"])
