@@ -74,11 +74,12 @@ def measure_scenes(
 
             result = measure(sample["scene"], predictor(sample), inputs, targets, show)
             result.early_exit.update(early_exit)
-            message = f"{name} {result.scene}, PSNR after steps of post-optimization: "
-            message += ", ".join(
-                f"{method[4:]}: {_means(result.rows, 'targets', method, 'images')['psnr']:.2f}"
+            psnrs = [
+                f"{_means(result.rows, 'targets', method, 'images')['psnr']:.2f} dB"
+                + f" after {method[4:]} steps" * (method != "post0")
                 for method in result.costs
-            )
+            ]
+            message = f"{name} {result.scene}: PSNR {', '.join(psnrs)}"
             bars.console.print(message, soft_wrap=True, highlight=False)
             return result
 

@@ -104,7 +104,7 @@ def mutate_yaml(stored: bytes, numbers: random.Random, values: Sequence[object])
     return yaml.safe_dump(content).encode()
 
 
-Result = Views | Gaussians | Tensor | None
+Result = Views | Gaussians | Tensor
 
 
 class Attack:
@@ -182,13 +182,10 @@ class Attack:
 
 def unusable(result: Result) -> dict[str, str]:
     """Return what is wrong with numbers that were read."""
-    if result is None:
-        return {}
+    if isinstance(result, Tensor):
+        return {} if result.isfinite().all() else {"not usable": "numbers that are not finite"}
     try:
-        if isinstance(result, Tensor) and not result.isfinite().all():
-            raise InputError("numbers that are not finite")
-        if not isinstance(result, Tensor):
-            result.validate()
+        result.validate()
     except InputError as error:
         return {"not usable": str(error)}
     return {}
