@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, cause_of, input_error_behind, plain_warnings
 from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
-from asysplat.overrides import check_overrides
+from asysplat.overrides import check_overrides, quote_paths
 from asysplat.root import CONF, ROOT, typed
 
 OmegaConf.register_new_resolver("typed", typed, replace=True)  # in the texts of --help
@@ -31,7 +31,7 @@ def check_command(script: str) -> None:
     """
     end_at_interrupt()
     os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
-    words = sys.argv[1:]
+    words = sys.argv[1:] = quote_paths(sys.argv[1:])
     args, unknown = get_args_parser().parse_known_args(words)
     other_files = args.config_dir or args.config_name or args.config_path
     if args.help:  # what Hydra prints, without the second that composing takes

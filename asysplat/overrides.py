@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -60,10 +61,28 @@ def as_overrides(words: list[str]) -> list[str]:
     switches = [f"{word[2:]}=true" for word in words if word in SWITCHES]
     words = [word for word in words if word not in SWITCHES]
     if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
-        # Hydra unescapes a backslash only before a quote.
-        quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
-        words[0] = f"path='{quoted}'"
+        words[0] = f"path={_quote(words[0])}"
     return words + switches
+
+
+def quote_paths(words: Iterable[str]) -> list[str]:
+    """Quote existing paths that Hydra cannot read otherwise, as run=logs/0_model=longlrm."""
+    quoted = []
+    for word in words:
+        key, _, value = word.partition("=")
+        try:
+            _parse(word)
+        except InputError:
+            if value and os.path.exists(value):
+                word = f"{key}={_quote(value)}"
+        quoted.append(word)
+    return quoted
+
+
+def _quote(value: str) -> str:
+    # Hydra unescapes a backslash only before a quote.
+    escaped = re.sub(r"(\\+)(?='|$)", r"\1\1", value).replace("'", "\\'")
+    return f"'{escaped}'"
 
 
 def _parse(override: str) -> Override:

@@ -132,6 +132,15 @@ def test_options_with_dashes_are_answered_by_how_they_are_given(given, monkeypat
         check_command("train")
 
 
+@pytest.mark.parametrize("name", ["0_model=longlrm", "my (scene)", "it's [1]", "plain", "0.5"])
+def test_existing_paths_need_no_quotes_of_their_own(tmp_path, monkeypatch, name):
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("sys.argv", ["evaluate.py", f"run={tmp_path / name}", "width=0.5"])
+    check_command("evaluate")
+    run, width = map(overrides._parse, sys.argv[1:])
+    assert run.value() == str(tmp_path / name) and width.value() == 0.5
+
+
 COMMAND = re.compile(
     r"(?:python |asysplat )(train|evaluate|reconstruct|report|benchmark)(?:\.py)?"
     r"((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)"
