@@ -17,11 +17,12 @@ from numpy import ndarray
 from asysplat.data.images import HEIF, Lens, image_size, same_proportions
 from asysplat.errors import InputError
 from asysplat.files import read_json
-from asysplat.scene import ORTHONORMAL_TOLERANCE
+from asysplat.scene import MAX_FIELD_OF_VIEW, ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg", *HEIF)
 MAX_NUMBER = 1e300
+MAX_POSITION = 1e18  # float32 can hold its square
 MAX_FOCAL, MAX_CENTER = 1000.0, 100.0  # in longer sides of the image
 MAX_DISTORTION = 1e3  # coefficients
 MILLIMETERS = 0.001  # meters: the usual unit of stored depths
@@ -111,14 +112,15 @@ def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     # Integers from JSON may be too large for a float.
     (width, height), lens_size = size, (min(lens.width, 10**9), min(lens.height, 10**9))
     numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(lens_size)
-    usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest
+    usable = longest < MAX_FIELD_OF_VIEW * min(lens.fx, lens.fy)
+    usable &= max(lens.fx, lens.fy) < MAX_FOCAL * longest
     usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
     if not (usable and all(abs(number) < MAX_DISTORTION for number in lens.distortion)):
         values = ", ".join(f"{min(number, MAX_NUMBER):g}" for number in numbers)
         raise InputError(
-            f"{where} has intrinsics {values}: give focal "
-            f"lengths in pixels, above 0 and below {MAX_FOCAL:g} image sides, a principal point "
-            f"within {MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
+            f"{where} has intrinsics {values}: give focal lengths in pixels, of "
+            f"1/{MAX_FIELD_OF_VIEW} to {MAX_FOCAL:g} image sides, a principal point within "
+            f"{MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
         )
     # To a pixel of the smaller one, whose size was rounded.
     if min(lens_size) < 1 or not same_proportions(*sorted((size, lens_size))):
@@ -173,13 +175,16 @@ def check_rigid(stored: object, where: str) -> Float[ndarray, "4 4"]:
     """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal.
 
     Raises:
-        InputError: another shape, numbers that are not finite, or scale, shear or mirroring.
+        InputError: another shape, numbers that float32 cannot hold, or scale, shear or mirroring.
     """
     matrix = to_array(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where} holds NaN or infinity: remove this image or repair its pose.")
+    if not (np.abs(matrix) < MAX_POSITION).all():
+        raise InputError(
+            f"{where} holds NaN, infinity or a number above {MAX_POSITION:g}: remove this image or "
+            "repair its pose."
+        )
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > ORTHONORMAL_TOLERANCE:
         raise InputError(f"{where} has last row {matrix[3].tolist()}: it must be 0 0 0 1.")
     rotation = matrix[:3, :3]

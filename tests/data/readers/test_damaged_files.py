@@ -124,7 +124,7 @@ class Attack:
         count: int,
         seed: str,
         change: Callable[[bytes, random.Random], bytes] = mutate,
-    ) -> list[str]:
+    ) -> str:
         """Read mutants of a file, and other things in its place; return what went wrong."""
         stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
         others = self._others(file)
@@ -137,7 +137,7 @@ class Attack:
             wrong += [f"{file.name} {index}: {what}" for what in self._read(read)]
         remove(file)
         file.write_bytes(stored)
-        return wrong
+        return "\n".join(wrong)
 
     def summary(self) -> str:
         """Return the counts in a line."""
@@ -211,7 +211,7 @@ def attack(tmp_path_factory):
     print(f"\n{attack.summary()}")
 
 
-def attack_scene(attack: Attack, layout: str, views, folder: Path, count: int) -> list[str]:
+def attack_scene(attack: Attack, layout: str, views, folder: Path, count: int) -> str:
     """Read mutants of each file of a scene, one image of each kind."""
     if layout == BINARY:
         root = as_binary(colmap.write(views, folder))
@@ -230,7 +230,7 @@ def attack_scene(attack: Attack, layout: str, views, folder: Path, count: int) -
     images = {path.suffix: path for path in paths if path.suffix in (".png", ".jpg")}
     files = [path for path in paths if path.suffix not in images] + [*images.values()]
     share = max(1, count // len(files))
-    return [line for file in files for line in attack(file, read, share, f"{layout}{file.name}")]
+    return "\n".join(attack(file, read, share, f"{layout}{file.name}") for file in files).strip()
 
 
 many_mutants = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
@@ -239,7 +239,7 @@ many_mutants = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=p
 @many_mutants
 @pytest.mark.parametrize("layout", [*NAMES, BINARY])
 def test_damaged_scenes_are_refused_or_usable(attack, layout, few, tmp_path, count):
-    assert attack_scene(attack, layout, few, tmp_path / "scene", count) == []
+    assert attack_scene(attack, layout, few, tmp_path / "scene", count) == ""
 
 
 @many_mutants
@@ -251,7 +251,7 @@ def test_damaged_gaussians_are_refused_or_usable(attack, suffix, make_scene, tmp
     else:
         scene, _ = make_scene(count=20, degree=1, dtype=torch.float32)
         write_gaussians(file, scene, Notes((1e6, 2.0, 3.0), (0.25, 0.5, 0.75)))
-    assert attack(file, lambda: read_gaussians(file, (0.0, 0.0, 0.0)), count, suffix) == []
+    assert attack(file, lambda: read_gaussians(file, (0.0, 0.0, 0.0)), count, suffix) == ""
 
 
 @many_mutants
@@ -260,7 +260,7 @@ def test_damaged_images_are_refused_or_usable(attack, suffix, tmp_path, count):
     file = tmp_path / f"image{suffix}"
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(file)
-    assert attack(file, lambda: torch.from_numpy(load_image(file)), count, suffix) == []
+    assert attack(file, lambda: torch.from_numpy(load_image(file)), count, suffix) == ""
 
 
 @pytest.mark.medium
@@ -280,9 +280,9 @@ def test_damaged_runs_are_refused_or_usable(attack, composed, few, tmp_path, cou
         with torch.inference_mode():
             return load(str(checkpoint))(views)
 
-    assert attack(checkpoint, read, count // 2, "checkpoint") == []
+    assert attack(checkpoint, read, count // 2, "checkpoint") == ""
     change = partial(mutate_yaml, values=values)
-    assert attack(config, read, count // 2, "config", change) == []
+    assert attack(config, read, count // 2, "config", change) == ""
 
 
 @pytest.mark.parametrize("kind", ["a link to itself", "a link to its folder", "60000 x 1 pixels"])
