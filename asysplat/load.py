@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
@@ -52,9 +53,14 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             )
         model = read_config(config_path).get("model")
         try:
+            with torch.device("meta"):  # without memory, which a stranger's sizes may exceed
+                planned = instantiate(model)
+            if not isinstance(planned, Network):
+                raise InputError(f"it is a {type(planned).__name__}, not a network")
+            size, count = path.stat().st_size, sum(p.numel() for p in planned.parameters())
+            if size < count:
+                raise InputError(f"it has {count:,} weights and {path.name} {size:,} bytes")
             net = instantiate(model)
-            if not isinstance(net, Network):
-                raise InputError(f"it is a {type(net).__name__}, not a network")
         except Exception as error:  # instantiate raises many kinds
             reason = input_error_behind(error) or repr(error.__cause__ or error).split("\\n")[0]
             raise InputError(

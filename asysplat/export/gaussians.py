@@ -95,7 +95,8 @@ def read_gaussians(
         return gaussians
     offset = torch.tensor(read_notes(Path(path)).offset, dtype=torch.float64)
     shift = offset - torch.tensor(origin, dtype=torch.float64)
-    return replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
+    moved = replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
+    return moved.validate(f"{path}, moved by its offset: Gaussians")
 
 
 def read_notes(path: Path) -> Notes:

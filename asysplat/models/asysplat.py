@@ -12,7 +12,7 @@ from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.network import TokenNetwork
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, Stage, build_component
+from asysplat.models.stage import MAX_LAYERS, Component, Stage, build_component
 from asysplat.models.tokenizer import Tokenizer
 
 APPEARANCE_MLP_RATIO = 4
@@ -164,12 +164,18 @@ def build_asysplat(
         components: the other arguments of AsySplat.
 
     Raises:
-        InputError: a ratio that no widths reach; a budget without a ratio.
+        InputError: a ratio that no widths reach; a budget without a ratio; a count of layers below
+            0 or above MAX_LAYERS.
     """
     if geometry_ratio is None and parameter_budget != 1:
         raise InputError(
             f"parameter_budget={parameter_budget} without a geometry_ratio: give both, or change "
             "width."
+        )
+    if not 0 <= appearance_layers <= MAX_LAYERS:
+        raise InputError(
+            f"model.appearance_layers={appearance_layers}: give a whole number from 0 to "
+            f"{MAX_LAYERS}."
         )
     widths = Widths(tuple(stage_widths), fine_width, head_dim).scaled(width)
 

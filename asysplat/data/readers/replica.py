@@ -16,6 +16,7 @@ from asysplat.data.readers.common import (
     check_rigid,
     folders_with,
     number,
+    scale_lens,
 )
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
@@ -23,6 +24,7 @@ from asysplat.files import read_json, read_text
 
 TRAJECTORY = "traj.txt"
 PARAMETERS = "cam_params.json"
+MIN_SCALE = 1e-9  # depth steps per meter
 HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's center at 0
 
 
@@ -50,8 +52,11 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         raise InputError(f'{parameters} has no "camera": copy it again from Replica.zip.')
     names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
     width, height, fx, fy, cx, cy, scale = (number(camera, n, str(parameters)) for n in names)
-    if min(width, height, fx, fy, scale) <= 0:
-        raise InputError(f"{parameters}: w, h, fx, fy and scale of its camera must be above 0.")
+    if min(width, height, fx, fy) <= 0 or scale < MIN_SCALE:
+        raise InputError(
+            f"{parameters}: w, h, fx and fy of its camera must be above 0, and scale at least "
+            f"{MIN_SCALE:g}."
+        )
     lens = Lens(round(width), round(height), fx, fy, cx + HALF_A_PIXEL, cy + HALF_A_PIXEL)
     trajectory, results = scene / TRAJECTORY, scene / "results"
     if not trajectory.is_file():
@@ -77,7 +82,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         pose = [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
         return PosedImage(
             file=image,
-            lens=lens,
+            lens=scale_lens(lens, size, str(image)),
             cam_to_world=check_rigid(pose, f"{trajectory}, row {index + 1}"),
             depth=check_map_size(depth, size, str(image)) if has_depths else None,
             depth_unit=1 / scale,
