@@ -9,9 +9,12 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.errors import InputError
 from asysplat.models.norm import RMSNorm
 from asysplat.models.shapes import StageShape
 from asysplat.ops import grid_attention
+
+MAX_GRID = 64  # each image is padded to a multiple of it, in tokens
 
 
 class MLP(nn.Sequential):
@@ -75,10 +78,17 @@ class SparseAttention(nn.Module):
     Args:
         grid: p_g.
         conv_blocks: whether to add the two conv blocks, which connect the grid places of a view.
+
+    Raises:
+        InputError: a grid below 1 or above MAX_GRID.
     """
 
     def __init__(self, shape: StageShape, grid: int = 2, conv_blocks: bool = True):
         super().__init__()
+        if grid not in range(1, MAX_GRID + 1):
+            raise InputError(
+                f"model.blocks.s.grid={grid}: give a whole number from 1 to {MAX_GRID}."
+            )
         # 32 channels of a convolution group at the paper's head_dim of 64
         group_width = max(1, shape.head_dim // 2)
         self.convs = ConvBlocks(shape.width, group_width) if conv_blocks else nn.Identity()
