@@ -260,7 +260,7 @@ def test_damaged_images_are_refused_or_usable(attack, suffix, tmp_path, count):
     file = tmp_path / f"image{suffix}"
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(file)
-    assert attack(file, lambda: torch.from_numpy(load_image(file)), count, suffix) == ""
+    assert attack(file, lambda: torch.tensor(load_image(file)), count, suffix) == ""
 
 
 @pytest.mark.medium
