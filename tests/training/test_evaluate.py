@@ -285,7 +285,7 @@ def test_3dgs_is_fitted_to_each_test_scene(evaluate, composed, tmp_path):
 
 
 def test_scaffold_gs_is_drawn_view_by_view(evaluate):
-    command = ["refinement=scaffold_gs", "refinement_seconds=1", *REFINED]
+    command = ["refinement=scaffold_gs", "refinement_steps=30", *REFINED]
     assert "add post_optimization_steps=0" in refusal(evaluate(*command))
     _, found = read_evaluation(evaluate(*command, "post_optimization_steps=0", "system=Scaffold"))
     assert found["evaluation/system"] == "Scaffold" and found["cost/gaussians"] > 0
