@@ -43,7 +43,7 @@ from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
 from asysplat.refinement import AnchorScene, ScaffoldSettings, refine, refine_scaffold
 from asysplat.refinement.init import initial_gaussians
-from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.checkpoints import build_within, existing_weights, load_weights
 from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
 from asysplat.runs.runs import EVALUATION
@@ -138,7 +138,10 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 
 def load_network(config: DictConfig, device: torch.device) -> Network:
     """Load a model, with its early exit."""
-    net = instantiate(config.model)
+    if config.init_path is None:
+        net = instantiate(config.model)
+    else:
+        net = build_within(config.model, existing_weights(config.init_path))
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs

@@ -82,11 +82,17 @@ def check_regular(path: str | Path) -> None:
         raise InputError(f"{path} is a pipe or a device: put a file in its place.")
 
 
-def read_text(path: Path, max_bytes: int = MAX_TEXT) -> str:
+def read_text(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") -> str:
     """Read UTF-8 text, with or without a byte order mark.
 
+    Args:
+        path: the file.
+        max_bytes: its size, at most.
+        errors: what to do with other bytes, as for `bytes.decode`.
+
     Raises:
-        InputError: a pipe, a device, a file of more than `max_bytes`, or one without permission.
+        InputError: a pipe, a device, a file of more than `max_bytes`, one without permission, or
+            other bytes if `errors` is "strict".
     """
     check_regular(path)
     try:
@@ -96,12 +102,14 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT) -> str:
                 f"{path} has {size:,} bytes where at most {max_bytes:,} are expected: write it "
                 "again."
             )
-        return path.read_text(encoding="utf-8-sig", errors="replace")
+        return path.read_text(encoding="utf-8-sig", errors=errors)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not UTF-8 text ({error}): write it again.") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): write it again.") from error
 
 
-def read_json(path: Path, max_bytes: int = MAX_TEXT) -> Any:
+def read_json(path: Path, errors: str = "replace") -> Any:
     """Read a JSON file.
 
     Raises:
@@ -109,7 +117,7 @@ def read_json(path: Path, max_bytes: int = MAX_TEXT) -> Any:
     """
     if not path.exists():
         raise InputError(f"{path} does not exist: put it there, or name another file.")
-    text = read_text(path, max_bytes)
+    text = read_text(path, errors=errors)
     if not text.strip():
         raise InputError(f"{path} is empty: write it again.")
     try:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
@@ -17,7 +16,7 @@ from asysplat.errors import InputError, input_error_behind
 from asysplat.models.network import Network
 from asysplat.overrides import check_overrides
 from asysplat.root import CONF
-from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.checkpoints import build_within, load_weights
 from asysplat.runs.run_config import read_config
 
 SHIPPED_MODEL = "model=asysplat_plane_sweep"
@@ -53,14 +52,7 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             )
         model = read_config(config_path).get("model")
         try:
-            with torch.device("meta"):  # without memory, which a stranger's sizes may exceed
-                planned = instantiate(model)
-            if not isinstance(planned, Network):
-                raise InputError(f"it is a {type(planned).__name__}, not a network")
-            size, count = path.stat().st_size, sum(p.numel() for p in planned.parameters())
-            if size < count:
-                raise InputError(f"it has {count:,} weights and {path.name} {size:,} bytes")
-            net = instantiate(model)
+            net = build_within(model, path)
         except Exception as error:  # instantiate raises many kinds
             reason = input_error_behind(error) or repr(error.__cause__ or error).split("\\n")[0]
             raise InputError(

@@ -70,10 +70,10 @@ def quote_paths(words: Iterable[str]) -> list[str]:
     quoted = []
     for word in words:
         key, _, value = word.partition("=")
-        try:
-            _parse(word)
-        except InputError:
-            if value and os.path.exists(value):
+        if value and os.path.exists(value):
+            try:
+                _parse(word)
+            except InputError:
                 word = f"{key}={_quote(value)}"
         quoted.append(word)
     return quoted

@@ -14,7 +14,7 @@ from asysplat.errors import InputError
 from asysplat.models.layers import Layers
 from asysplat.models.shapes import StageShape
 
-MAX_LAYERS = 999  # of a kind; a configuration may come from someone else
+MAX_LAYERS = 999  # of a stage; a configuration may come from someone else
 Component = Callable[..., nn.Module]
 Built = TypeVar("Built", bound=nn.Module)
 
@@ -106,14 +106,15 @@ def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
         letters: letters that name a block.
 
     Raises:
-        InputError: anything else, no layer at all, or more than MAX_LAYERS of a kind.
+        InputError: anything else, no layer at all, or more than MAX_LAYERS.
     """
-    terms = re.findall(rf"(\d{{1,{len(str(MAX_LAYERS))}}})([a-z])", mix)
-    layers = [letter for count, letter in terms for _ in range(int(count))]
+    terms = re.findall(r"(\d{1,3})([a-z])", mix)
+    total = sum(int(count) for count, _ in terms)
+    known = letters.issuperset(letter for _, letter in terms)
     well_formed = "".join(f"{count}{letter}" for count, letter in terms) == mix.replace("+", "")
-    if not well_formed or not layers or not letters.issuperset(layers):
+    if not (well_formed and known and 0 < total <= MAX_LAYERS):
         raise InputError(
             f"model.layers={mix[:80]!r}: expected counts and letters of {sorted(letters)}, "
-            "such as 4m4s or 7m1t."
+            f"such as 4m4s or 7m1t, at most {MAX_LAYERS} in all."
         )
-    return layers
+    return [letter for count, letter in terms for _ in range(int(count))]

@@ -77,9 +77,10 @@ def _read_results(path: Path) -> dict[str, int | float | None]:
     def refuse(constant: str) -> None:
         raise ValueError(f"it has the number {constant}")
 
+    content = read_text(path, MAX_BYTES, "strict")
     try:
-        results = json.loads(read_text(path, MAX_BYTES), parse_constant=refuse)
-    except (OSError, ValueError, RecursionError) as error:
+        results = json.loads(content, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error}): copy the run again.") from error
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")

@@ -29,13 +29,13 @@ def read_config(path: Path) -> DictConfig:
         InputError: the file cannot be read, has a `_target_` that no file of conf/ has, values
             without names, or an interpolation, which could hide any.
     """
-    text = read_text(path, MAX_BYTES)
+    text = read_text(path, MAX_BYTES, "strict")
     try:
         # Without anchors, whose aliases repeat them, the bytes bound the values.
         if "&" in text and _count_nodes(yaml.compose(text, yaml.SafeLoader), {}) > MAX_NODES:
             raise ValueError(f"its aliases make more than {MAX_NODES:,} values")
         content = OmegaConf.to_container(OmegaConf.load(io.StringIO(text)))
-    # ValueError: also an integer of thousands of digits, or text that is not UTF-8.
+    # OSError: neither a dictionary nor a list; ValueError: also an integer of thousands of digits.
     except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = str(error).split("\n")[0]
         raise InputError(f"{path} cannot be read ({reason}): copy the run again.") from error

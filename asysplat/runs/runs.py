@@ -176,12 +176,12 @@ def find_runs(logs: Path) -> Iterator[Run]:
         if any((path.parent / name).exists() for name in RECONSTRUCTION):
             continue
         try:
-            results = read_json(path)
+            results = read_json(path, "strict")
             hash_now = _config_hash_now(path.parent, results)
             seed, commit = results["run/seed"], results["run/revision"]
             extra = path.with_name(EVALUATION)
             if extra.exists():
-                results.update(read_json(extra))
+                results.update(read_json(extra, "strict"))
         except (ValueError, KeyError, TypeError):
             warnings.warn(
                 f"{path} is not the results of a finished run: it is left out.", stacklevel=2

@@ -70,7 +70,7 @@ def find_systems(logs: Path) -> Iterator[Run]:
     """Yield every finished evaluation of another system below `logs`, oldest first."""
     for path in files_below(logs, EVALUATION):
         try:
-            results: Mapping[str, Any] = read_json(path)
+            results: Mapping[str, Any] = read_json(path, "strict")
             if SYSTEM not in results:
                 continue
             described = (
