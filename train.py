@@ -107,6 +107,7 @@ def find_logs(overrides: list[str]) -> Path:
 if __name__ == "__main__":
     with exit_with_message("stopped."):
         check_writable(find_logs(sys.argv), "paths.logs")
-    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
+    folder_or_exit = exit_with_message("stopped.")(run_folder)  # Hydra would print a traceback
+    OmegaConf.register_new_resolver("run_folder", folder_or_exit, replace=True, use_cache=True)
     OmegaConf.register_new_resolver("job_name", job_name, replace=True)
     main()  # SweepTable ends a sweep with how to resume

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from asysplat.errors import InputError
 from asysplat.files import read_text
-from asysplat.root import CONF
+from asysplat.root import CONF, ROOT
 from asysplat.runs.old_names import upgrade_config
 
 MAX_BYTES, MAX_NODES = 2**20, 100_000  # size of a configuration: ours have 10 KB and 500 values
@@ -22,11 +22,12 @@ MAX_BYTES, MAX_NODES = 2**20, 100_000  # size of a configuration: ours have 10 K
 def read_config(path: Path) -> DictConfig:
     """Read the config.yaml of a run, under today's names.
 
-    Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted. A
-    cache and downloads are not the run's to choose: there is no cache, and nothing is downloaded.
+    Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted, and
+    for a model, which holds no data and no logger, those of conf/model/. A cache and downloads are
+    not the run's to choose: there is no cache, and nothing is downloaded.
 
     Raises:
-        InputError: the file cannot be read, has a `_target_` that no file of conf/ has, values
+        InputError: the file cannot be read, has a `_target_` that none of these files has, values
             without names, or an interpolation, which could hide any.
     """
     text = read_text(path, MAX_BYTES, "strict")
@@ -76,10 +77,11 @@ def _check_targets(path: Path, node: object, key: str = "") -> None:
         node = dict(enumerate(node))
     for name, value in node.items() if isinstance(node, dict) else ():
         inner = f"{key}.{name}".removeprefix(".")
-        if name == "_target_" and str(value) not in _known_targets():
+        folder = CONF / "model" if inner.startswith("model.") else CONF
+        if name == "_target_" and str(value) not in _known_targets(folder):
             raise InputError(
-                f"{path}: {inner} is {value!r}, which no file of conf/ names: a run may build only "
-                "those classes; if it is one of yours, name it in a file of conf/."
+                f"{path}: {inner} is {value!r}, which no file of {folder.relative_to(ROOT)}/ "
+                "names: a run may build only those classes; if it is one of yours, name it there."
             )
         _check_targets(path, value, inner)
         if name == "_args_":
@@ -90,9 +92,9 @@ def _check_targets(path: Path, node: object, key: str = "") -> None:
 
 
 @cache
-def _known_targets() -> set[str]:
-    """Return every `_target_` of conf/."""
-    files = CONF.rglob("*.yaml")
+def _known_targets(folder: Path) -> set[str]:
+    """Return every `_target_` in the files of a folder."""
+    files = folder.rglob("*.yaml")
     return {name for file in files for name in re.findall(r"_target_: *(\S+)", file.read_text())}
 
 

@@ -25,6 +25,9 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
 
     An interrupted run resumes in its own folder. Other runs that start from a checkpoint, such as
     more steps of a finished run, get the folder `new`. `runs` has all runs of one name.
+
+    Raises:
+        InputError: the folder to resume in has links, through which Hydra would write.
     """
     if ckpt_path == "last":
         try:
@@ -37,7 +40,10 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
         return new
     # An earlier stage has its folder inside the run's.
     run = folder.parent if (folder.parent / LOCK).exists() else folder
-    return new if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
+    if not has_checkpoints(folder) or (run / RESULTS).exists():
+        return new
+    refuse_links(run)
+    return str(run)
 
 
 def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:

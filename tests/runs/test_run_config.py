@@ -39,7 +39,7 @@ def test_no_other_class_is_built(run, tmp_path, target, key):
     called = {"_target_": target, "a": f"open({str(tmp_path / 'written')!r}, 'w')"}
     file = run(lambda content: content["model"].update({key: [called]}))
     file.touch()
-    with pytest.raises(InputError, match="no file of conf/ names"):
+    with pytest.raises(InputError, match="no file of conf/model/ names"):
         load(str(file))
     assert not (tmp_path / "written").exists()
 
@@ -50,14 +50,24 @@ def test_no_other_class_is_built(run, tmp_path, target, key):
         ("${oc.decode:'{_target_: os.system}'}", "no interpolations"),
         ("\\${oc.decode:'{_target_: os.system}'}", "no interpolations"),
         ({"_target_": "${model.name}"}, "no interpolations|no file of conf/"),
-        ({"_target_": ["os.system"]}, "no file of conf/"),
-        ({"_target_": {"a": 1}}, "no file of conf/"),
+        ({"_target_": ["os.system"]}, "no file of conf/model"),
+        ({"_target_": {"a": 1}}, "no file of conf/model"),
     ],
 )
 def test_a_target_cannot_be_hidden(run, value, message):
     file = run(lambda content: content["model"].update(head=value))
     with pytest.raises(InputError, match=message):
         read_config(file.parents[1] / "config.yaml")
+
+
+def test_a_model_holds_only_parts_of_models(tmp_path):
+    """One with a data set would read all of a disk, one with a logger would write."""
+    scenes, file = {"_target_": "asysplat.data.files_data", "root": "/"}, tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump({"model": {"prior": scenes}}))
+    with pytest.raises(InputError, match="files_data', which no file of conf/model/ names"):
+        read_config(file)
+    file.write_text(yaml.safe_dump({"data": scenes}))
+    assert read_config(file).data == scenes
 
 
 BOMB = "a0: &a0 [1, 2]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
@@ -81,11 +91,11 @@ def test_caches_and_downloads_are_not_the_runs(run, tmp_path):
     cache = {"_target_": "asysplat.data.ImageCache", "folder": str(tmp_path), "disk_gb": 0}
 
     def change(content):
-        content["data"]["cache"] = content["model"]["cache"] = cache
+        content["data"]["cache"] = cache
         content["training"]["loss"]["more"] = [{"download": True}]
 
     config = read_config(run(change).parents[1] / "config.yaml")
-    assert config.data.cache is None and config.model.cache is None
+    assert config.data.cache is None
     assert config.training.loss.more[0].download is False
 
 

@@ -128,6 +128,7 @@ class Attack:
         """Read mutants of a file, and other things in its place; return what went wrong."""
         stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
         others = self._others(file)
+        assert not unusable(read())  # and what is compiled at the first call takes no mutant's time
         for index in range(count + len(others)):
             remove(file)
             if index < count:
