@@ -5,6 +5,7 @@ python evaluate.py run=last
 
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,7 @@ from asysplat.refinement.init import initial_gaussians
 from asysplat.runs.checkpoints import build_within, existing_weights, load_weights
 from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
+from asysplat.runs.run_config import using_config
 from asysplat.runs.runs import EVALUATION
 from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views
@@ -61,19 +63,18 @@ def evaluate(options: DictConfig) -> None:
     target = find_target(options, HydraConfig.get().overrides.task)
     config = target.config
     check_writable(target.scene_folder, "paths.logs")
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
-    # The device and the precision of a prediction, as in the test of train.py.
-    accelerator = find_accelerator(config.trainer.accelerator)
-    try:
-        precision = config.trainer.precision
-        fabric = lightning.Fabric(accelerator=accelerator, devices=1, precision=precision)
-    except (ValueError, MisconfigurationException) as error:
-        raise InputError(f"trainer: {error}") from error
-    measure = make_measure(config, options, fabric.device)
-    net = load_network(config, fabric.device) if target.system is None else None
-    data = instantiate(config.data)
-    data.setup()
-    data.check_sizes(measure.protocol.check_size)
+    with using_config(target.file) if target.file else nullcontext():
+        lightning.seed_everything(config.seed, workers=True, verbose=False)
+        fabric = make_fabric(config)
+        measure = make_measure(config, options, fabric.device)
+        net = build_network(config) if target.system is None else None
+        data = instantiate(config.data)
+        data.setup()
+        data.check_sizes(measure.protocol.check_size)
+    if net is not None:
+        load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+        net.to(fabric.device).eval()
+        print(f"model: {net.describe()}")
     tests, early_exit, fingerprint = data.tests, {}, target.fingerprint
     if net is not None:
         data.check_sizes(net.check_size)
@@ -110,6 +111,16 @@ def evaluate(options: DictConfig) -> None:
     print_evaluation(results, list(scenes), target.folder)
 
 
+def make_fabric(config: DictConfig) -> lightning.Fabric:
+    """Return the device and the precision of a prediction, as in the test of train.py."""
+    accelerator = find_accelerator(config.trainer.accelerator)
+    try:
+        precision = config.trainer.precision
+        return lightning.Fabric(accelerator=accelerator, devices=1, precision=precision)
+    except (ValueError, MisconfigurationException) as error:
+        raise InputError(f"trainer: {error}") from error
+
+
 def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
     """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing.
 
@@ -136,16 +147,13 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     return PostOptimization(steps, protocol, lpips, background)
 
 
-def load_network(config: DictConfig, device: torch.device) -> Network:
-    """Load a model, with its early exit."""
+def build_network(config: DictConfig) -> Network:
+    """Build a model, with its early exit; that of a checkpoint first without memory."""
     if config.init_path is None:
         net = instantiate(config.model)
     else:
         net = build_within(config.model, existing_weights(config.init_path))
-    load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
-    net.to(device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
-    print(f"model: {net.describe()}")
     return net
 
 

@@ -12,12 +12,12 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from torch import nn
 
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.overrides import check_overrides
 from asysplat.root import CONF
 from asysplat.runs.checkpoints import build_within, load_weights
-from asysplat.runs.run_config import read_config
+from asysplat.runs.run_config import read_config, using_config
 
 SHIPPED_MODEL = "model=asysplat_plane_sweep"
 
@@ -51,13 +51,8 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
                 "folder of its run."
             )
         model = read_config(config_path).get("model")
-        try:
+        with using_config(config_path):
             net = build_within(model, path)
-        except Exception as error:  # instantiate raises many kinds
-            reason = input_error_behind(error) or repr(error.__cause__ or error).split("\\n")[0]
-            raise InputError(
-                f"{config_path}: model cannot be built ({reason}): copy the run again."
-            ) from error
     else:
         if not any(override.startswith("model=") for override in overrides):
             overrides = [SHIPPED_MODEL, *overrides]

@@ -1,5 +1,6 @@
 """Batches of tasks: the same for the same seed, wherever a run is resumed."""
 
+import re
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -79,8 +80,8 @@ class SceneDataModule(lightning.LightningDataModule):
         growth_steps: optimizer steps in which the window of the training tasks grows.
 
     Raises:
-        InputError: a task that cannot be loaded. `setup` tries one training task, and all of the
-            fixed ones that are kept in memory.
+        InputError: a name that no file can have, or a task that cannot be loaded: `setup` tries one
+            training task, and all of the fixed ones that are kept in memory.
     """
 
     # Without Lightning's default, which is None.
@@ -105,6 +106,13 @@ class SceneDataModule(lightning.LightningDataModule):
         super().__init__()
         self.evaluation: dict[str, FixedTasks] = {}  # val and test of this data set
         self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
+        for name in (self.name, *self.test_sets):
+            # Files of results are named by them, and keys, whose parts a slash separates.
+            if not (isinstance(name, str) and re.fullmatch(r"\w[^/\\\0\n]{0,99}", name)):
+                raise InputError(
+                    f"data.name or a key of data.test_sets is {name!r:.200}: give at most "
+                    "100 characters without slashes, the first a letter or a digit."
+                )
 
     def setup(self, stage: str | None = None) -> None:
         """Load the validation and test tasks, and try one training task."""

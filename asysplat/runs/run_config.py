@@ -1,8 +1,12 @@
-"""Read the configuration of a run, which may come from another machine and must not run code."""
+"""Read and use the configuration of a run, which may come from another machine.
+
+It must not run code.
+"""
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -11,7 +15,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, input_error_behind
 from asysplat.files import read_text
 from asysplat.root import CONF, ROOT
 from asysplat.runs.old_names import upgrade_config
@@ -47,6 +51,23 @@ def read_config(path: Path) -> DictConfig:
     return OmegaConf.create(_without_caches(content))
 
 
+@contextmanager
+def using_config(path: Path) -> Generator[None]:
+    """Name a run's config.yaml in the errors of what is built from it, which are of many kinds.
+
+    Raises:
+        InputError: any of them.
+    """
+    try:
+        yield
+    except Exception as error:
+        mistake = input_error_behind(error)
+        if mistake is not None:
+            raise InputError(f"{path}: {mistake}") from error
+        reason = repr(error.__cause__ or error).split("\\n")[0]
+        raise InputError(f"{path} cannot be used ({reason:.500}): copy the run again.") from error
+
+
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     """Count the values of a node after its aliases are expanded; `known` has those of others."""
     if node is None or isinstance(node, yaml.ScalarNode):
@@ -72,7 +93,9 @@ def _without_caches(node: Any) -> Any:
 
 def _check_targets(path: Path, node: object, key: str = "") -> None:
     if isinstance(node, str) and "${" in node:
-        raise InputError(f"{path}: {key} is {node!r}: a run's configuration has no interpolations.")
+        raise InputError(
+            f"{path}: {key} is {node!r:.200}: a run's configuration has no interpolations."
+        )
     if isinstance(node, list):
         node = dict(enumerate(node))
     for name, value in node.items() if isinstance(node, dict) else ():
@@ -80,7 +103,7 @@ def _check_targets(path: Path, node: object, key: str = "") -> None:
         folder = CONF / "model" if inner.startswith("model.") else CONF
         if name == "_target_" and str(value) not in _known_targets(folder):
             raise InputError(
-                f"{path}: {inner} is {value!r}, which no file of {folder.relative_to(ROOT)}/ "
+                f"{path}: {inner} is {value!r:.200}, which no file of {folder.relative_to(ROOT)}/ "
                 "names: a run may build only those classes; if it is one of yours, name it there."
             )
         _check_targets(path, value, inner)

@@ -39,6 +39,14 @@ def with_test_sets(test_sets, **changes):
     return procedural_data(test_sets=test_sets, **(options | changes))
 
 
+@pytest.mark.parametrize("name", ["", "/etc/x", "../../x", ".x", "a\0b", "x" * 101])
+def test_names_that_no_file_can_have_are_refused(name):
+    """A run's results are written under them, and its configuration may be a stranger's."""
+    for options in ({"name": name}, {"test_sets": {name: list}}):
+        with pytest.raises(InputError, match=r"data\.name or a key of data\.test_sets is "):
+            procedural(**options)
+
+
 def set_up(data):
     data.setup()
     return data

@@ -3,9 +3,11 @@
 pytest tests/data/readers -m slow -k damaged -s reads 24,000 and prints what became of them.
 """
 
+import json
 import os
 import random
 import re
+import shutil
 import time
 import traceback
 import warnings
@@ -34,6 +36,7 @@ from asysplat.errors import InputError
 from asysplat.export.gaussians import Notes
 from asysplat.scene import Gaussians, Views
 
+OLD_RUN = Path(__file__).parents[2] / "runs" / "old_run"
 BINARY = "colmap, binary"
 SECONDS = 5.0
 FEW = 24  # mutants of each kind in the fast test
@@ -284,6 +287,25 @@ def test_damaged_runs_are_refused_or_usable(attack, composed, few, tmp_path, cou
     assert attack(checkpoint, read, count // 2, "checkpoint") == ""
     change = partial(mutate_yaml, values=values)
     assert attack(config, read, count // 2, "config", change) == ""
+
+
+@pytest.mark.medium
+@many_mutants
+def test_damaged_configurations_are_refused_or_measured(attack, run_script, tmp_path, count):
+    """Mutants of all of a run's configuration, data and metrics too, which is evaluated."""
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    results, options = run / "evaluation.json", ["post_optimization_steps=[0]"]
+
+    def read() -> Tensor:
+        result = run_script("evaluate.py", f"run={run}", f"paths.logs={tmp_path}", *options)
+        if result.returncode == 0:
+            numbers = json.loads(results.read_text()).values()
+            return torch.tensor([x for x in numbers if isinstance(x, float)])
+        assert result.stderr.splitlines()[-1].startswith("error: "), result.stderr
+        raise InputError(result.stderr)
+
+    change = partial(mutate_yaml, values=hostile_values(attack.outside / "folder"))
+    assert attack(run / "config.yaml", read, count // 4, "evaluated", change) == ""
 
 
 @pytest.mark.parametrize("kind", ["a link to itself", "a link to its folder", "60000 x 1 pixels"])
