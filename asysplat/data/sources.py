@@ -17,6 +17,7 @@ from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
 
 MAX_OPEN = 64  # scenes of a folder
+MAX_SCENES = 100_000  # synthetic ones of a split, which are listed before any is drawn
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,9 @@ class ProceduralSource:
         val_scenes, test_scenes: number of scenes of each split.
         places: content of the scenes: both, rooms or outdoors.
         varied: whether training scenes are varied; see ProceduralScene.
+
+    Raises:
+        InputError: more than MAX_SCENES to validate or test.
     """
 
     height: int
@@ -85,6 +89,8 @@ class ProceduralSource:
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         selection = views.uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
+        if count > MAX_SCENES:
+            raise InputError(f"data.{split}_scenes is {count}: give at most {MAX_SCENES:,}.")
         return [Task(self._scene(split, index), selection) for index in range(count)]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:

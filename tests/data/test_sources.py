@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from asysplat.data import FilesSource, SceneOptions, sources
+from asysplat.data import FilesSource, ProceduralSource, SceneOptions, sources
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection.kmeans import kmeans_selection
 from asysplat.data.selection.views import Selection, held_out
@@ -163,3 +163,10 @@ def test_an_index_that_does_not_fit_the_scenes_is_refused(folder, index):
         FilesSource(root, SIZE, (12, 24), **(options | {"selection": "kmeans"}))
     with pytest.raises(InputError, match=r"data\.on_bad_image=skip changes the numbers"):
         FilesSource(root, SceneOptions(8, 8, on_bad_image="skip"), (12, 24), **options)
+
+
+def test_synthetic_scenes_that_no_list_holds_are_refused():
+    source = ProceduralSource(8, 8, IMAGES, None, val_scenes=1, test_scenes=10**30)
+    assert len(source.evaluation("val", 2, 1)) == 1
+    with pytest.raises(InputError, match=r"data\.test_scenes is 10{30}: give at most 100,000"):
+        source.evaluation("test", 2, 1)
