@@ -64,7 +64,8 @@ def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     options = stage.trainer_options(callbacks, logger)
     trainer = instantiate_option(config, "trainer", **options)
     stage.begin(trainer, data)
-    trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
+    with stage.resuming(trainer):
+        trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
     net.early_exit = early_exit
     trainer.test(module, data, verbose=False)
     run.record(stage, trainer, callbacks)

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Collection
 
 MAX_NAMES = 5  # names in a message
+MAX_CHARACTERS = 500  # of another error's in a message
 
 
 class InputError(ValueError):
@@ -36,6 +37,11 @@ def input_error_behind(error: BaseException) -> InputError | None:
 def cause_of(error: BaseException) -> BaseException | None:
     """Return the error that `error` was raised from, or while it was handled."""
     return error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+
+
+def brief(error: BaseException) -> str:
+    """Return the class and the first line of an error, for a message."""
+    return repr(error.__cause__ or error).split("\\n")[0][:MAX_CHARACTERS]
 
 
 def plain_warnings() -> None:

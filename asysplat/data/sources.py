@@ -64,9 +64,6 @@ class ProceduralSource:
         val_scenes, test_scenes: number of scenes of each split.
         places: content of the scenes: both, rooms or outdoors.
         varied: whether training scenes are varied; see ProceduralScene.
-
-    Raises:
-        InputError: more than MAX_SCENES to validate or test.
     """
 
     height: int
@@ -87,6 +84,11 @@ class ProceduralSource:
         return Task(scene, views.training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
+        """See Source.
+
+        Raises:
+            InputError: a split of more than MAX_SCENES.
+        """
         selection = views.uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
         if count > MAX_SCENES:

@@ -34,7 +34,7 @@ class Protocol:
         depth_alignment: see `metrics.abs_rel`; for data without metric depth "median".
 
     Raises:
-        InputError: an option is none of its choices.
+        InputError: an option is none of its choices, or the name no word.
     """
 
     name: str
@@ -49,6 +49,8 @@ class Protocol:
         hints = get_type_hints(type(self))
         for field in fields(self):
             value, hint = getattr(self, field.name), hints[field.name]
+            if hint is str and not isinstance(value, str):
+                raise InputError(f"metrics.{field.name} is {value!r}: give a word.")
             choices = (True, False) if hint is bool else get_args(hint)
             if choices and value not in choices:
                 raise InputError(

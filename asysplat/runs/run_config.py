@@ -15,7 +15,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError, brief, input_error_behind
 from asysplat.files import read_text
 from asysplat.root import CONF, ROOT
 from asysplat.runs.old_names import upgrade_config
@@ -64,8 +64,7 @@ def using_config(path: Path) -> Generator[None]:
         mistake = input_error_behind(error)
         if mistake is not None:
             raise InputError(f"{path}: {mistake}") from error
-        reason = repr(error.__cause__ or error).split("\\n")[0]
-        raise InputError(f"{path} cannot be used ({reason:.500}): copy the run again.") from error
+        raise InputError(f"{path} cannot be used ({brief(error)}): copy the run again.") from error
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:

@@ -3,7 +3,7 @@
 train.py instantiates what the configuration names, fits and tests; the rest of a run is here.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.errors import InputError
+from asysplat.errors import InputError, brief, input_error_behind
 from asysplat.models.early_exit import EarlyExit
 from asysplat.runs.checkpoints import (
     check_checkpoint,
@@ -134,6 +134,25 @@ class TrainingStage:
             OmegaConf.save(self.config, self.folder / "config.yaml", resolve=True)
         if trainer.logger is not None and not resumes:
             log_choices(trainer.logger, self.config)
+
+    @contextmanager
+    def resuming(self, trainer: lightning.Trainer) -> Generator[None]:
+        """Name the checkpoint in an error before the first step, which is of restoring it.
+
+        Raises:
+            InputError: another version wrote it, or it was changed.
+        """
+        try:
+            yield
+        except Exception as error:
+            known = isinstance(error, OSError | MemoryError | torch.OutOfMemoryError)
+            begun = trainer.train_dataloader is not None
+            if self.checkpoint is None or begun or known or input_error_behind(error):
+                raise
+            raise InputError(
+                f"ckpt_path={self.checkpoint} cannot be resumed ({brief(error)}): init_path in "
+                "place of ckpt_path starts from its weights, with a new optimizer and schedule."
+            ) from error
 
 
 def instantiate_option(config: DictConfig, key: str, **arguments: object) -> Any:

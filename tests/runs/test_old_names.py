@@ -118,3 +118,18 @@ def test_it_is_evaluated_resumed_and_started_from(old_run, config, run_script, t
     assert result.returncode == 0, result.stderr
     assert f"run: {old_run}" in result.stdout
     assert torch.load(last, map_location="meta", weights_only=True)["global_step"] == 3
+
+
+@pytest.mark.medium
+def test_a_checkpoint_that_cannot_be_restored_is_a_sentence(old_run, train):
+    """As of an optimizer that had other parts, in an earlier version or in a stranger's file."""
+    last = old_run / "checkpoints" / "last.ckpt"
+    stored = torch.load(last, weights_only=True)
+    del stored["optimizer_states"][0]["param_groups"][0]["params"]
+    torch.save(stored, last)
+    (old_run / "metrics.json").unlink()
+    options = [*overrides_of_today(), "logger=none", "data.test_sets=null", "callbacks.costs=null"]
+    result = train(*options, f"ckpt_path={last}", "steps=3")
+    expected = f"error: ckpt_path={last} cannot be resumed (KeyError('params')): init_path in place"
+    assert result.stderr.splitlines()[-1].startswith(expected) and result.returncode == 1
+    assert "Traceback" not in result.stderr
