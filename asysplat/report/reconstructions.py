@@ -1,6 +1,5 @@
 """Read the finished reconstructions below a folder, which may come from strangers."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,14 +7,11 @@ from typing import Any, NamedTuple
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.files import read_text
 from asysplat.runs.run_config import flat_options, read_config
 from asysplat.runs.runs import RECONSTRUCTION, RESULTS
-from asysplat.runs.summary import RECONSTRUCTION_ROWS
+from asysplat.runs.summary import RECONSTRUCTION_ROWS, read_results
 
 CONFIG = "config.yaml"
-MAX_BYTES = 2**20  # of metrics.json, which has 2 KB
-MAX_NUMBER = 1e12  # in metrics.json
 MAX_TEXT = 60  # characters of a value
 COUNTS = ("gaussians", "steps", "seconds")
 SHOWN = ("psnr", "ssim", "lpips")
@@ -65,34 +61,17 @@ def _read_run(folder: Path) -> Reconstruction:
     for name in (CONFIG, RESULTS):
         if name not in stats:
             raise InputError(f"{folder} is unfinished: it has no {name} of its own.")
-    results = _read_results(folder / RESULTS)
+    found = read_results(folder / RESULTS)
+    for key in COUNTS:
+        if found.get(key) is None:
+            raise InputError(f"{folder / RESULTS} has nothing as {key}: copy the run again.")
+    measured = [f"{row}/{metric}" for row in RECONSTRUCTION_ROWS.values() for metric in SHOWN]
+    results = {key: found.get(key) for key in (*COUNTS, *measured)}
     options = flat_options(OmegaConf.to_container(read_config(folder / CONFIG)))
     if not isinstance(options.get("path"), str):
         raise InputError(f"{folder / CONFIG} has no path of photographs: copy the run again.")
     sizes = {name: stat.st_size for name, stat in stats.items()}
     return Reconstruction(folder, stats[RESULTS].st_mtime, results, options, sizes)
-
-
-def _read_results(path: Path) -> dict[str, int | float | None]:
-    def refuse(constant: str) -> None:
-        raise ValueError(f"it has the number {constant}")
-
-    content = read_text(path, MAX_BYTES, "strict")
-    try:
-        results = json.loads(content, parse_constant=refuse)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read ({error}): copy the run again.") from error
-    if not isinstance(results, dict):
-        raise InputError(f"{path} is not the results of a run: copy the run again.")
-    measured = {f"{row}/{metric}": None for row in RECONSTRUCTION_ROWS.values() for metric in SHOWN}
-    results = {key: results.get(key) for key in (*COUNTS, *measured)}
-    for key, value in results.items():
-        absent = value is None and key in measured  # not measured, or not finite
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not absent and not (number and abs(value) < MAX_NUMBER):
-            found = "nothing" if value is None else cut(repr(value))
-            raise InputError(f"{path} has {found} as {key}: copy the run again.")
-    return results
 
 
 def cut(text: str) -> str:

@@ -8,7 +8,8 @@ from omegaconf import DictConfig
 
 from asysplat.report.paper import Number, PaperRow, PaperTable
 from asysplat.runs.runs import Run
-from asysplat.runs.systems import SYSTEM, TESTED, options_of_test
+from asysplat.runs.summary import TESTED
+from asysplat.runs.systems import SYSTEM, options_of_test
 
 # Costs of refinements; other systems have none.
 COSTS = {"inference_seconds": "cost/post0/seconds", "inference_gb": "cost/post0/gb"}

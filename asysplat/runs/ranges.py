@@ -1,6 +1,7 @@
 """Check the values of the most used options, before any work starts."""
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import TypeGuard
 
@@ -16,7 +17,9 @@ def is_whole(value: object, low: int | float = 0, below: int | float = math.inf)
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # Not math.isfinite, which no whole number of 310 digits passes without an OverflowError.
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and abs(value) <= sys.float_info.max
 
 
 def is_window(value: object, low: int | float = -math.inf) -> bool:

@@ -17,12 +17,12 @@ from omegaconf import MISSING, DictConfig, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.errors import InputError
-from asysplat.files import read_json
 from asysplat.runs.checkpoints import weights_file
-from asysplat.runs.old_names import FORMAT, upgrade_results
+from asysplat.runs.old_names import FORMAT
 from asysplat.runs.revision import revision
 from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
+from asysplat.runs.summary import read_results
 
 RESULTS = "metrics.json"
 PICTURE = "contact.png"  # in the folder of a reconstruction
@@ -176,18 +176,18 @@ def find_runs(logs: Path) -> Iterator[Run]:
         if any((path.parent / name).exists() for name in RECONSTRUCTION):
             continue
         try:
-            results = read_json(path, "strict")
+            results = read_results(path)
             hash_now = _config_hash_now(path.parent, results)
             seed, commit = results["run/seed"], results["run/revision"]
             extra = path.with_name(EVALUATION)
             if extra.exists():
-                results.update(read_json(extra, "strict"))
+                results.update(read_results(extra))
         except (ValueError, KeyError, TypeError):
             warnings.warn(
                 f"{path} is not the results of a finished run: it is left out.", stacklevel=2
             )
             continue
-        yield Run(path.parent, hash_now, seed, commit, upgrade_results(results))
+        yield Run(path.parent, hash_now, seed, commit, results)
 
 
 def find_reconstructions(logs: Path) -> list[Path]:

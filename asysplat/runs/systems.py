@@ -8,13 +8,11 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
-from asysplat.files import read_json
-from asysplat.runs.old_names import upgrade_results
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import EVALUATION, Run, content_of, files_below, hash_of, name_of
+from asysplat.runs.summary import TESTED, read_results
 
 SYSTEM = "evaluation/system"
-TESTED = "tested/"
 # Options of the data that choose the images of a test, and their size.
 IMAGES = ("inputs", "targets", "height", "width", "selection")
 IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
@@ -70,13 +68,13 @@ def find_systems(logs: Path) -> Iterator[Run]:
     """Yield every finished evaluation of another system below `logs`, oldest first."""
     for path in files_below(logs, EVALUATION):
         try:
-            results: Mapping[str, Any] = read_json(path, "strict")
+            results = read_results(path)
             if SYSTEM not in results:
                 continue
             described = (
                 results[f"evaluation/{key}"] for key in ("config_hash", "seed", "revision")
             )
-            run = Run(path.parent, *described, upgrade_results(results))
+            run = Run(path.parent, *described, results)
         except (ValueError, KeyError, TypeError):
             warnings.warn(f"{path} is not a finished evaluation: it is left out.", stacklevel=2)
             continue

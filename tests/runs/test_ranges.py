@@ -20,6 +20,7 @@ REFUSED = {
     "data.num_workers=-1": "data.num_workers=-1: give a whole number of at least 0.",
     "data.height=abc": "data.height=abc: give a whole number of at least 1.",
     "learning_rate=nan": "learning_rate=nan: give a number above 0.",
+    f"learning_rate={10**400}": "learning_rate=10",  # more than a float holds
     "training.optimizer.weight_decay=-1": "training.optimizer.weight_decay=-1: give a number",
     "training.schedule.warmup_steps=2.5": "training.schedule.warmup_steps=2.5: give a whole number",
     "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",
