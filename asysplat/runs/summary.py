@@ -17,6 +17,7 @@ from asysplat.terminal import make_console, print_table
 
 MAX_NUMBER = 1e18  # in metrics.json
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
+RESIDUAL = f"{TESTED}residual"  # largest error of cameras that were fitted to their scenes
 TEXTS = ("run/", "evaluation/", "protocol/")  # groups of results that are texts
 WHOLE = tuple(f"{group}/{name}" for group in ("run", "evaluation") for name in ("seed", "format"))
 Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
@@ -51,7 +52,7 @@ def read_results(path: Path) -> Results:
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")
     for key, value in results.items():
-        if key.startswith(TESTED):  # options of any type, which are only compared
+        if key.startswith(TESTED) and key != RESIDUAL:  # options of any type, only compared
             continue
         if key in WHOLE:
             fits, expected = is_whole(value), "a whole number"

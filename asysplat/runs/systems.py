@@ -16,6 +16,10 @@ SYSTEM = "evaluation/system"
 # Options of the data that choose the images of a test, and their size.
 IMAGES = ("inputs", "targets", "height", "width", "selection")
 IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
+# What a report says of an evaluation.
+SHOWN = {
+    f"{TESTED}{key}" for key in ("scenes", "data", "inputs", "height", "width", "metrics.name")
+}
 
 
 def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,6 +79,8 @@ def find_systems(logs: Path) -> Iterator[Run]:
                 results[f"evaluation/{key}"] for key in ("config_hash", "seed", "revision")
             )
             run = Run(path.parent, *described, results)
+            if missing := SHOWN - results.keys():
+                raise KeyError(*missing)
         except (ValueError, KeyError, TypeError):
             warnings.warn(f"{path} is not a finished evaluation: it is left out.", stacklevel=2)
             continue
