@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import OmegaConf
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, printable
 from asysplat.runs.run_config import flat_options, read_config
 from asysplat.runs.runs import RECONSTRUCTION, RESULTS
 from asysplat.runs.summary import RECONSTRUCTION_ROWS, read_results
@@ -41,7 +41,7 @@ def read_reconstructions(folder: Path) -> tuple[list[Reconstruction], list[str]]
         try:
             runs.append(_read_run(Path(place)))
         except (InputError, OSError) as error:
-            left_out.append(plain(str(error).replace(f"{folder}{os.sep}", "")))
+            left_out.append(printable(str(error).replace(f"{folder}{os.sep}", "")))
 
     def order(run: Reconstruction) -> tuple:
         path = run.options["path"]
@@ -77,8 +77,3 @@ def _read_run(folder: Path) -> Reconstruction:
 def cut(text: str) -> str:
     """Return a text, or its beginning if it is long."""
     return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."
-
-
-def plain(text: str) -> str:
-    """Replace characters that a terminal obeys, or that UTF-8 does not have."""
-    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)

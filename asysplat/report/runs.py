@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from rich.text import Text
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, printable
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.metrics import METRICS
 from asysplat.export.gaussians import WRITERS
@@ -22,7 +22,6 @@ from asysplat.report.reconstructions import (
     SHOWN,
     Reconstruction,
     cut,
-    plain,
     read_reconstructions,
 )
 from asysplat.report.table import Cell, Grid, Heading
@@ -214,7 +213,7 @@ def _own_options(runs: Sequence[Reconstruction]) -> list[list[str]]:
     """Write, for each reconstruction, the options that others have with other values."""
     texts = [
         {
-            key: plain(_value_text(value))
+            key: printable(_value_text(value))
             for key, value in run.options.items()
             if key.partition(".")[0] not in NOT_SHOWN
         }
@@ -227,7 +226,7 @@ def _own_options(runs: Sequence[Reconstruction]) -> list[list[str]]:
     keys = sorted(values, key=lambda key: (key.count("."), key))
     differing = [key for key in keys if len(values[key]) > 1]
     return [
-        [cut(f"{plain(key)}={options[key]}") for key in differing if key in options]
+        [cut(f"{printable(key)}={options[key]}") for key in differing if key in options]
         for options in texts
     ]
 
@@ -246,14 +245,14 @@ def _short_names(paths: Collection[str]) -> dict[str, str]:
         parts, others = Path(path).parts, [Path(other).parts for other in paths if other != path]
         lengths = range(1, len(parts) + 1)
         unique = (n for n in lengths if parts[-n:] not in [other[-n:] for other in others])
-        names[path] = plain("/".join(parts[-next(unique, len(parts)) :]) or path)
+        names[path] = printable("/".join(parts[-next(unique, len(parts)) :]) or path)
     return names
 
 
 def _name(folder: Path, run: Reconstruction) -> str:
     """Return a reconstruction's folder as it is called below `folder`."""
     name = run.folder.relative_to(folder).as_posix()
-    return plain(run.folder.absolute().name if name == "." else name)
+    return printable(run.folder.absolute().name if name == "." else name)
 
 
 def _cell(text: str) -> Cell:
