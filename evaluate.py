@@ -67,14 +67,10 @@ def evaluate(options: DictConfig) -> None:
         lightning.seed_everything(config.seed, workers=True, verbose=False)
         fabric = make_fabric(config)
         measure = make_measure(config, options, fabric.device)
-        net = build_network(config) if target.system is None else None
+        net = load_network(config, fabric.device) if target.system is None else None
         data = instantiate(config.data)
         data.setup()
         data.check_sizes(measure.protocol.check_size)
-    if net is not None:
-        load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
-        net.to(fabric.device).eval()
-        print(f"model: {net.describe()}")
     tests, early_exit, fingerprint = data.tests, {}, target.fingerprint
     if net is not None:
         data.check_sizes(net.check_size)
@@ -147,13 +143,16 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     return PostOptimization(steps, protocol, lpips, background)
 
 
-def build_network(config: DictConfig) -> Network:
-    """Build a model, with its early exit; that of a checkpoint first without memory."""
+def load_network(config: DictConfig, device: torch.device) -> Network:
+    """Load a model, with its early exit."""
     if config.init_path is None:
         net = instantiate(config.model)
     else:
         net = build_within(config.model, existing_weights(config.init_path))
+    load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+    net.to(device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
+    print(f"model: {net.describe()}")
     return net
 
 

@@ -18,11 +18,12 @@ from rich.progress import (
 from torch.utils.data import Dataset
 
 from asysplat.data.datamodule import Sample
+from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
 from asysplat.evaluation.rows import ImageRow, average
-from asysplat.files import atomic_write, make_folder
+from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.rendering import Rendering
 from asysplat.terminal import make_console
 
@@ -84,17 +85,34 @@ def measure_scenes(
             return result
 
         results: dict[str, list[SceneResult]] = {name: [] for name in tests}
+        stored = 0
         for name, samples in tests.items():
             for index in range(len(samples)):
                 path = scene_folder / f"{name}-{index}.json"
                 if path.exists():
-                    result = SceneResult(**json.loads(path.read_text()))
+                    result = read_result(path)
+                    stored += 1
                 else:
                     result = measure_scene(name, index)
                     save_result(path, result)
                 results[name].append(result)
                 bars.advance(scenes)
+        if stored:
+            message = f"measured before, as {scene_folder} has them: {stored} scenes"
+            bars.console.print(message, soft_wrap=True, highlight=False)
     return results
+
+
+def read_result(path: Path) -> SceneResult:
+    """Read what `save_result` wrote.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        return SceneResult(**read_json(path, "strict"))
+    except TypeError as error:
+        raise InputError(f"{path} is not the result of a scene: remove it.") from error
 
 
 def save_result(path: Path, result: SceneResult) -> None:

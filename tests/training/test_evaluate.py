@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -138,8 +139,14 @@ def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path,
 
     # What is finished is read; another set of steps is another evaluation.
     measured.clear()
-    read_evaluation(evaluate(*command, STEPS))
-    assert measured == []
+    again = evaluate(*command, STEPS)
+    read_evaluation(again)
+    assert measured == [] and re.search(r"measured before, as \S+ has them: 6 scenes", again.stdout)
+    stored = min(kept)
+    for damage in ("{", "[]", "{}"):
+        stored.write_text(damage)
+        refused = evaluate(*command, STEPS)
+        assert f"error: {stored} is" in refused.stderr and "Traceback" not in refused.stderr
     alone = "data.test_sets=null"
     read_evaluation(evaluate(*command, "post_optimization_steps=[0,2]", alone))
     assert measured == ["procedural-0", "procedural-1"]
