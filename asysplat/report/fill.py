@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.report.notes import rows_by_text
+from asysplat.report.notes import data_text, rows_by_text
 from asysplat.report.paper import (
     Costs,
     Number,
@@ -124,8 +124,8 @@ def fill_table(
     height, width = data.test_size or (data.height, data.width)
     stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
     notes = {
-        "Ours": f"{data.name} data, {data.inputs} input views of {height}x{width}, {stages}, "
-        f"{config.width:g} of the paper's width",
+        "Ours": f"{data_text(data.name, data.get('places'))}, {data.inputs} input views of "
+        f"{height}x{width}, {stages}, {config.width:g} of the paper's width",
         "Head": rows_by_text(heads),
         "Not tested": _untested(sets, config, rows),
         "Baselines": _baselines(sets, used),

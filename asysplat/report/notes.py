@@ -96,6 +96,11 @@ def _revisions(filled: PaperTable) -> str:
     return "runs of several are mixed: " * (len(rows) > 1) + rows_by_text(rows)
 
 
+def data_text(name: str, places: str | None) -> str:
+    """Name the data, and the kind of its synthetic scenes if they are of one only."""
+    return f"{name} data" + f" ({places})" * (places not in (None, "both"))
+
+
 def rows_by_text(rows: Mapping[str, Sequence[str]]) -> str:
     """Write each text with the rows that it is about; a single text, which is about all, alone."""
     if len(rows) < 2:

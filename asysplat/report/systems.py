@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from omegaconf import DictConfig
 
+from asysplat.report.notes import data_text
 from asysplat.report.paper import Number, PaperRow, PaperTable
 from asysplat.runs.runs import Run
 from asysplat.runs.summary import TESTED
@@ -88,9 +89,9 @@ def _fill(
 def _describe(run: Run) -> str:
     """Write what an evaluation was made on."""
     tested = {k.removeprefix(TESTED): v for k, v in run.results.items() if k.startswith(TESTED)}
-    text = f"{tested['scenes']} scenes of {tested['data']} data, {tested['inputs']} input views of "
-    text += f"{tested['height']}x{tested['width']}, metrics {tested['metrics.name']}, "
-    text += f"seed {run.seed}, {run.folder}"
+    text = f"{tested['scenes']} scenes of {data_text(tested['data'], tested.get('places'))}, "
+    text += f"{tested['inputs']} input views of {tested['height']}x{tested['width']}, "
+    text += f"metrics {tested['metrics.name']}, seed {run.seed}, {run.folder}"
     if "residual" in tested:
         text += f", cameras fitted with a residual of {tested['residual']:.1%} at most"
     return text

@@ -120,6 +120,14 @@ def test_further_systems_are_added_to_tables_that_quote_some(compose, write, tmp
     assert len(fill(compose, tmp_path, "layers")[0].rows) == len(load_paper()["layers"].rows)
 
 
+def test_synthetic_scenes_of_one_kind_are_named(compose, write, tmp_path):
+    rooms = ["experiment=two_views", "metrics=pixelsplat", "data.places=rooms"]
+    write("FreeSplat", 24.0, *rooms)
+    filled, rows = fill(compose, tmp_path, "two_views", "data.places=rooms")
+    assert "12 scenes of procedural data (rooms), 2 input views" in rows["FreeSplat"].note
+    assert "procedural data (rooms), 2 input views" in filled.notes["Ours"]
+
+
 def test_damaged_evaluations_are_left_out(tmp_path):
     for name, text in (("a", "{"), ("b", "7"), ("c", '{"evaluation/system": "x"}'), ("d", "{}")):
         (tmp_path / name).mkdir()
