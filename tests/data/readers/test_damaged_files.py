@@ -293,6 +293,7 @@ def test_damaged_runs_are_refused_or_usable(attack, composed, few, tmp_path, cou
 
 
 @pytest.mark.medium
+@pytest.mark.timeout(1500)
 @many_mutants
 def test_damaged_configurations_are_refused_or_measured(attack, run_script, tmp_path, count):
     """Mutants of all of a run's configuration, data and metrics too, which is evaluated."""
