@@ -109,15 +109,15 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") ->
         raise InputError(f"{path} cannot be read ({error.strerror}): write it again.") from error
 
 
-def read_json(path: Path, errors: str = "replace") -> Any:
-    """Read a JSON file.
+def read_json(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") -> Any:
+    """Read a JSON file; for the arguments see `read_text`.
 
     Raises:
         InputError: the file is missing, empty, too large or no JSON; see `read_text`.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist: put it there, or name another file.")
-    text = read_text(path, errors=errors)
+    text = read_text(path, max_bytes, errors)
     if not text.strip():
         raise InputError(f"{path} is empty: write it again.")
     try:

@@ -110,7 +110,7 @@ def read_result(path: Path) -> SceneResult:
         InputError: it is damaged.
     """
     try:
-        return SceneResult(**read_json(path, "strict"))
+        return SceneResult(**read_json(path, errors="strict"))
     except TypeError as error:
         raise InputError(f"{path} is not the result of a scene: remove it.") from error
 

@@ -15,7 +15,8 @@ from asysplat.runs.old_names import upgrade_results
 from asysplat.runs.ranges import is_number, is_whole
 from asysplat.terminal import make_console, print_table
 
-MAX_NUMBER = 1e18  # in metrics.json
+MAX_BYTES = 2**20  # of metrics.json, which has 2 KB
+MAX_NUMBER = 1e12  # in metrics.json
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
 RESIDUAL = f"{TESTED}residual"  # largest error of cameras that were fitted to their scenes
 TEXTS = ("run/", "evaluation/", "protocol/")  # groups of results that are texts
@@ -48,7 +49,7 @@ def read_results(path: Path) -> Results:
         InputError: it is missing or damaged, or a value is of another type than is written, or a
             number of more than MAX_NUMBER.
     """
-    results = read_json(path, "strict")
+    results = read_json(path, MAX_BYTES, "strict")
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")
     for key, value in results.items():

@@ -91,6 +91,13 @@ def test_results_of_other_types_are_refused(tmp_path, key, value):
         read_results(path)
 
 
+def test_results_of_megabytes_are_refused(tmp_path):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(METRICS) + " " * 2**20)
+    with pytest.raises(InputError, match=r"at most 1,048,576 are expected"):
+        read_results(path)
+
+
 PSNR = {"kitchen": [10.0, 20.0, 30.0], "hall": [40.0], "street": [30.0, 50.0]}
 ABSREL = {"kitchen": [0.1, math.nan, 0.3], "hall": [math.nan], "street": [0.8, 0.6]}
 
