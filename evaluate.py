@@ -118,11 +118,7 @@ def make_fabric(config: DictConfig) -> lightning.Fabric:
 
 
 def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
-    """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing.
-
-    Raises:
-        InputError: steps of post-optimization of images, or of Gaussians of each view.
-    """
+    """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing."""
     protocol = instantiate(config.metrics)
     lpips = load_lpips(protocol.lpips_net, Path(options.paths.weights), options.paths.download)
     if lpips is None:

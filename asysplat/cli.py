@@ -131,7 +131,6 @@ def error_message(error: BaseException) -> str | None:
 
 
 def _is_lost_connection(error: BaseException) -> bool:
-    """Return whether an error is that of NCCL or Gloo where another process has ended."""
     message = str(error)  # errors of their set-up, such as a port in use, have the same types
     words = ("reset by peer", "closed by peer", "Broken pipe")
     by_gloo = "gloo" in message and any(word in message for word in words)

@@ -23,9 +23,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     The file is synced to disk before. Any exception, KeyboardInterrupt too, leaves `path` unchanged
     and no temporary file. A link is replaced, and what it names stays: it may come with a
     stranger's folder.
-
-    Raises:
-        InputError: the file cannot be written: no such folder, no permission, a full disk.
     """
     target = Path(path).absolute()
     if target.exists() and not target.is_file():
@@ -51,11 +48,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def make_folder(path: Path, option: str) -> None:
-    """Create a folder if there is none.
-
-    Raises:
-        InputError: it cannot be created or written to; the message names the option that sets it.
-    """
+    """Create a folder if there is none."""
     reason = None
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -73,11 +66,7 @@ def has_file(path: Path) -> bool:
 
 
 def check_regular(path: str | Path) -> None:
-    """Check that a path is no pipe or device, which may have no end.
-
-    Raises:
-        InputError: it is.
-    """
+    """Check that a path is no pipe or device, which may have no end."""
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise InputError(f"{path} is a pipe or a device: put a file in its place.")
 
@@ -89,10 +78,6 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") ->
         path: the file.
         max_bytes: its size, at most.
         errors: what to do with other bytes, as for `bytes.decode`.
-
-    Raises:
-        InputError: a pipe, a device, a file of more than `max_bytes`, one without permission, or
-            other bytes if `errors` is "strict".
     """
     check_regular(path)
     try:
@@ -110,11 +95,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") ->
 
 
 def read_json(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") -> Any:
-    """Read a JSON file; for the arguments see `read_text`.
-
-    Raises:
-        InputError: the file is missing, empty, too large or no JSON; see `read_text`.
-    """
+    """Read a JSON file; for the arguments see `read_text`."""
     if not path.exists():
         raise InputError(f"{path} does not exist: put it there, or name another file.")
     text = read_text(path, max_bytes, errors)
@@ -128,11 +109,7 @@ def read_json(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") ->
 
 
 def refuse_links(folder: Path) -> None:
-    """Check that a folder holds no symbolic links, through which one would write elsewhere.
-
-    Raises:
-        InputError: it does.
-    """
+    """Check that a folder holds no symbolic links, through which one would write elsewhere."""
     for place, folders, files in os.walk(folder):
         for path in (Path(place) / name for name in (*folders, *files)):
             if path.is_symlink():
@@ -143,11 +120,7 @@ def refuse_links(folder: Path) -> None:
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Check that a folder is, or can be created, writable; leave the disk as it is.
-
-    Raises:
-        InputError: see `make_folder`.
-    """
+    """Check that a folder is, or can be created, writable; leave the disk as it is."""
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         make_folder(path, option)
@@ -158,11 +131,7 @@ def check_writable(path: Path, option: str) -> None:
 
 
 def check_room(folder: Path, room: int) -> None:
-    """Check that the disk of a folder has `room` bytes of free space.
-
-    Raises:
-        InputError: it has less.
-    """
+    """Check that the disk of a folder has `room` bytes of free space."""
     free = shutil.disk_usage(folder).free
     if free < room:
         raise InputError(
@@ -177,9 +146,6 @@ def new_folder(path: Path, room: int) -> Path:
     Args:
         path: the folder.
         room: bytes that must be free on its disk.
-
-    Raises:
-        InputError: the folder cannot be created, or its disk is too full.
     """
     make_folder(path.parent, "paths.logs")
     for folder in chain([path], (path.with_name(f"{path.name}-{n}") for n in count(2))):

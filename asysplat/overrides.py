@@ -27,10 +27,6 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
     Args:
         overrides: `key=value`, in Hydra's syntax; Hydra's own options are not checked.
         script: name of the configuration file in conf/.
-
-    Raises:
-        InputError: an override cannot be parsed, or an unknown name; the message suggests the
-            nearest ones.
     """
     composed, settings = [], []
     for override in map(_parse, overrides):
@@ -138,7 +134,6 @@ def _compose(script: str, overrides: Sequence[Override]) -> dict:
 
 
 def _paths(config: dict, prefix: str = "") -> Iterator[str]:
-    """Yield the dotted path of every option, such as data.cache.folder, and of its parents."""
     for key, value in config.items():
         yield f"{prefix}{key}"
         if isinstance(value, dict):

@@ -45,11 +45,7 @@ class TensorRecord:
 
     @classmethod
     def stack(cls: type[Record], records: Sequence[Record]) -> Record:
-        """Stack records of equal shapes along a new first dimension.
-
-        Raises:
-            InputError: a number, such as the size of the images, that differs between the records.
-        """
+        """Stack records of equal shapes along a new first dimension."""
         stacked = {}
         for field in fields(cls):
             values = [getattr(record, field.name) for record in records]

@@ -84,11 +84,7 @@ class ResultsComparison:
 
 
 def read_old(path: str | None, output: Path) -> Result | None:
-    """Read the results to compare with, if a path is given; new ones will be written to `output`.
-
-    Raises:
-        InputError: the file cannot be read, is not of this suite, or would be overwritten.
-    """
+    """Read the results to compare with; `output`, where new ones are written, must be elsewhere."""
     if path is None:
         return None
     try:
@@ -112,9 +108,6 @@ def compare(old: Result, new: Result, tracked: TrackedMetrics) -> ResultsCompari
     """Compare all tracked numbers that both results have.
 
     A change counts if it exceeds the threshold of its kind, and the sum of the noise of both.
-
-    Raises:
-        InputError: the results have no tracked number in common.
     """
     before, after = _values(old, tracked), _values(new, tracked)
     if before and not before.keys() & after.keys():

@@ -289,7 +289,6 @@ def _find_others(case: Case, output: Tensor, row: Result) -> dict[str, libraries
 
 
 def _line(row: Result) -> str:
-    """Write an operator's times, or what is wrong."""
     if row["kernels"] is None:
         return f"{row['operator']}: {row['fault']}"
     times = {name: row[name] for name in ("kernels", "torch", "library") if row[name]}

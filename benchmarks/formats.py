@@ -38,9 +38,6 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": for each format, its megabytes, seconds to write and to read, and the PSNR of its
         pictures against those of the original.
-
-    Raises:
-        InputError: `options.formats.scene` is missing, or has no cameras beside it.
     """
     if options.formats.scene is None:
         raise InputError("formats.scene is missing: give the scene.ply of a reconstruction.")

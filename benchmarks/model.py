@@ -97,9 +97,6 @@ def make_net(
 
     Returns:
         The network, and its "inputs" (number of input views), "height" and "width".
-
-    Raises:
-        InputError: the model is unknown, or an override is.
     """
     command = [f"model={name}", *(f"{key}={value}" for key, value in overrides.items())]
     check_overrides(command)

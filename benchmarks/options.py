@@ -22,21 +22,13 @@ CPU = torch.device("cpu")
 
 
 def find_suite(name: str) -> ModuleType:
-    """Import the suite called `name`.
-
-    Raises:
-        InputError: no suite has this name.
-    """
+    """Import the suite called `name`."""
     check_names("suite", [name], SUITES)
     return import_module(SUITES[name])
 
 
 def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Check the names that an option was given.
-
-    Raises:
-        InputError: the option has no name, or one that is not among `known`.
-    """
+    """Check the names that an option was given."""
     for name in list(names) or [None]:
         if name not in known:
             raise InputError(f"{option}={name} is unknown: choose from {', '.join(known)}.")

@@ -133,11 +133,7 @@ class FeedForward:
         return self.checkpoint is not None
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Load the network; return the function that renders a scene on the device.
-
-        Raises:
-            InputError: the weights of the checkpoint do not fit the overrides.
-        """
+        """Load the network; return the function that renders a scene on the device."""
         net = _load_network(self.checkpoint, tuple(self.overrides))
         dtype = torch.float64 if self.precision == EXACT else torch.float32
         if (device, dtype) != (CPU, torch.float32):
@@ -185,11 +181,7 @@ class Refined:
             )
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Check the refinement's settings; return the function that renders a scene on the CPU.
-
-        Raises:
-            InputError: a setting of the refinement is unknown or out of range.
-        """
+        """Check the refinement's settings; return the function that renders a scene on the CPU."""
         try:
             settings = instantiate(OmegaConf.merge(refinement, dict(self.refinement)))
         except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
@@ -223,11 +215,7 @@ def _load_network(checkpoint: str | None, overrides: tuple[str, ...]) -> Network
 
 
 def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
-    """Return the settings of each of `config.families` by name: the base, and the variants.
-
-    Raises:
-        InputError: a family, a variant or a value is unknown, or a value is out of range.
-    """
+    """Return the settings of each of `config.families` by name: the base, and the variants."""
     check_names("pareto.families", config["families"], FAMILIES)
     families = {}
     for family in config["families"]:
@@ -271,9 +259,6 @@ def find_scenes(
         Functions that open the scenes, and the reasons why other scenes are absent, both by name.
         The functions take the side of the photographs in pixels, and the largest numbers of input
         and of held-out views.
-
-    Raises:
-        InputError: a name is unknown, or every scene is absent.
     """
     present = sorted(path.name for path in folder.glob("*") if path.is_dir())
     check_names(option, names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
@@ -316,9 +301,6 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
 
     Depths are dropped. A scene with fewer than `views` input views keeps them all; one for which
     `views` or `side` is None is returned as it is.
-
-    Raises:
-        InputError: `side` exceeds that of the photographs.
     """
     if views is None or side is None:
         return scene
@@ -351,9 +333,6 @@ def _measure_scene(
     Settings with a limit in seconds run once, all others take turns in rounds. Networks run on the
     device, refinements on the CPU. `advance` is called after each of the `count_runs` runs. The row
     of a variant that cannot render this scene has the reason in "not_measured", and no numbers.
-
-    Raises:
-        InputError: the base cannot render this scene.
     """
     base = settings[BASE]
     family_device = CPU if isinstance(base, Refined) else device

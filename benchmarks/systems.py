@@ -87,9 +87,6 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each scene, system and mark: seconds, steps and Gaussians, the metrics of
         the held-out views. "not_measured": the reason for what was not measured.
-
-    Raises:
-        InputError: a scene or a system is unknown; marks that are not above 0 and increasing.
     """
     config = OmegaConf.to_container(options.systems, resolve=True)
     marks, shared = config["marks"], Path(config["shared"])

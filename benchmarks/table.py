@@ -113,11 +113,7 @@ def error_column(path: str) -> WriteCell:
 
 
 def format_json(value: Any, indent: str = "") -> str:
-    """Write JSON in which each row of a list, and each dictionary of plain values, is one line.
-
-    Raises:
-        ValueError: a number is NaN or infinite.
-    """
+    """Write JSON in which each row of a list, and each dictionary of plain values, is one line."""
     line = json.dumps(value, allow_nan=False)
     items = value.values() if isinstance(value, dict) else value
     if len(line) <= WIDTH or not any(isinstance(item, dict | list) for item in items):
@@ -132,12 +128,7 @@ def format_json(value: Any, indent: str = "") -> str:
 def write_results(
     results: Result, tables: Sequence[Table], figure: Figure | None, path: Path
 ) -> list[Path]:
-    """Write <path>.json, <path>.md and, if there is a figure, <path>.png; return their paths.
-
-    Raises:
-        InputError: a file cannot be written.
-        ValueError: a result is NaN or infinite.
-    """
+    """Write <path>.json, <path>.md and, if there is a figure, <path>.png; return their paths."""
     texts = {".json": format_json(results) + "\n", ".md": "\n".join(map(format_markdown, tables))}
     path.parent.mkdir(parents=True, exist_ok=True)
     for suffix, content in texts.items():

@@ -162,30 +162,3 @@ def test_every_command_handles_signals(repository):
     handled = {path for path, block in commands.items() if "    handle_signals()" in block}
     handled |= {path for path in commands if "@command(" in path.read_text()}
     assert set(commands) == handled
-
-
-def own_nodes(function):
-    """The nodes of a function without those of functions in it."""
-    for node in ast.iter_child_nodes(function):
-        if not isinstance(node, ast.FunctionDef):
-            yield node
-            yield from own_nodes(node)
-
-
-def test_a_function_that_raises_input_errors_says_when(sources):
-    """But functions in functions, and hooks, whose classes say it."""
-    raising, silent = 0, []
-    for module, tree in sources.items():
-        bodies = [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]
-        functions = [f for body in bodies for f in body.body if isinstance(f, ast.FunctionDef)]
-        for function in functions:
-            if function.name.startswith(("_", "on_")) or function.name == "main":
-                continue
-            raised = [node.exc for node in own_nodes(function) if isinstance(node, ast.Raise)]
-            names = {getattr(getattr(error, "func", None), "id", None) for error in raised}
-            if "InputError" in names and module.startswith("asysplat"):
-                raising += 1
-                words = ast.get_docstring(function) or ""
-                if "Raises:" not in words and "aise InputError" not in words:
-                    silent.append(f"{module}.{function.name}")
-    assert raising and silent == []

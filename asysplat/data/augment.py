@@ -28,9 +28,6 @@ class Augmentation:
         white_balance: greatest change in stops of a task's red and blue, relative to its green.
         flicker: greatest change in stops of one input, relative to the other views.
         noise: greatest standard deviation of the noise in a task's inputs.
-
-    Raises:
-        InputError: a number outside [0, 1], or a crop of 0.
     """
 
     reverse: float = 0.0

@@ -19,9 +19,6 @@ class BadImages:
 
     Args:
         policy: "fail", or "skip" to go on without the images that cannot be used.
-
-    Raises:
-        InputError: another policy.
     """
 
     def __init__(self, policy: Policy = "fail"):
@@ -54,9 +51,6 @@ class BadImages:
         Args:
             scene: name of the scene, for the message.
             usable: number of its images that can be used.
-
-        Raises:
-            InputError: there are errors and the policy is "fail", or too few images are left.
         """
         bad, total = len(self.errors), usable + len(self.errors)
         different = list(dict.fromkeys(self.errors))

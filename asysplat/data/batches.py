@@ -34,9 +34,6 @@ def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> Bat
         micro_batch: the most scenes that a process may hold at a time; fewer where these do not
             divide its scenes; None: all of its scenes.
         processes: number of processes that train together.
-
-    Raises:
-        InputError: the batch does not divide among the processes.
     """
     scenes, remainder = divmod(batch_size, processes)
     if remainder:

@@ -24,9 +24,6 @@ def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> Sc
             width, num_images, test_scenes or places; and prune (see Task).
         options: options of ProceduralSource and SceneDataModule; and test_size, the height and
             width of every test set that does not set its own, None for the size of training.
-
-    Raises:
-        InputError: a test set has the name of the data set, or an unknown option.
     """
     sets = tested_sets(test_sets, options["name"], on_disk=False)
     changeable = ("num_images", "test_scenes", "places")
@@ -41,9 +38,6 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
             layout, scenes, selection, index and root. A set whose root is null is left out, with a
             warning.
         options: options of FilesSource, SceneOptions and SceneDataModule; and test_size.
-
-    Raises:
-        InputError: as `procedural_data` and FilesSource.
     """
     missing = [
         name

@@ -186,7 +186,6 @@ class SceneDataModule(lightning.LightningDataModule):
 
     @property
     def _process(self) -> tuple[int, int]:
-        """The rank of this process, and the number of processes."""
         trainer = self.trainer
         return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 

@@ -22,9 +22,6 @@ def save_sharp_frames(video: Path, folder: Path, count: int, progress: Progress)
     """Save the sharpest frame of each of `count` equal parts of a video, upright, as NNNNN.png.
 
     All frames if there are fewer.
-
-    Raises:
-        InputError: PyAV is missing, or a file without frames that can be read.
     """
     with _video(video) as (container, stream):
         times = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
@@ -77,7 +74,6 @@ def _video(path: Path) -> Generator[tuple[Any, Any]]:  # of PyAV, an optional de
 
 
 def _sharpness(pixels: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the variance of the Laplacian, of a smaller image, where noise weighs less."""
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     scale = COMPARED_SIDE / max(gray.shape)
     if scale < 1:

@@ -139,20 +139,12 @@ def same_proportions(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
-    """Read RGB in 0..255, on a white background where the image is transparent.
-
-    Raises:
-        InputError: the file holds more than 8 bits of gray (a depth map).
-    """
+    """Read RGB in 0..255, on a white background where the image is transparent."""
     return _read(path, _to_rgb)
 
 
 def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
-    """Read the stored integers of a one-channel (16-bit) image; 0 where unknown.
-
-    Raises:
-        InputError: the file has several channels.
-    """
+    """Read the stored integers of a one-channel (16-bit) image; 0 where unknown."""
     stored = _read(path, np.asarray)
     if stored.ndim != 2:
         raise InputError(
@@ -219,7 +211,6 @@ def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3
 def _centered_box(
     old_width: int, old_height: int, height: int, width: int
 ) -> tuple[float, float, float, float, float]:
-    """Return the scale, and left, top, right, bottom in old pixels, exactly centered."""
     scale = max(width / old_width, height / old_height)
     left = max(0.0, (old_width - width / scale) / 2)
     top = max(0.0, (old_height - height / scale) / 2)

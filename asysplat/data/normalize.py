@@ -58,9 +58,6 @@ def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalizatio
     Returns:
         inputs and targets in the network's frame, and the transform; its scale is 1 if all inputs
         have the same position.
-
-    Raises:
-        InputError: views on a device without float64.
     """
     poses = to_float64(inputs.cameras.cam_to_world)
     centers = poses[:, :3, 3]

@@ -127,9 +127,6 @@ def near_origin(scene: PosedScene) -> PosedScene:
     """Move a scene that is far from the origin, such as a geo-referenced one, to its cameras' mean.
 
     Float32 would not resolve its poses. The mean is rounded to whole units.
-
-    Raises:
-        InputError: float64 does not resolve the poses either.
     """
     centers = np.array([image.cam_to_world[:3, 3] for image in scene.images]).reshape(-1, 3)
     if any(scene.origin) or not np.isfinite(centers).all() or not len(centers):
@@ -182,11 +179,7 @@ class FileSequence:
         return self.scene.points
 
     def views(self, indices: Sequence[int]) -> Views:
-        """Return the images at `indices`, in that order.
-
-        Raises:
-            InputError: a file whose pixels are damaged.
-        """
+        """Return the images at `indices`, in that order."""
         images = [self.scene.images[index] for index in indices]
 
         def stack(available: bool, read: Callable[[PosedImage], Tensor]) -> Tensor | None:

@@ -84,11 +84,7 @@ class ProceduralSource:
         return Task(scene, views.training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
-        """See Source.
-
-        Raises:
-            InputError: a split of more than MAX_SCENES.
-        """
+        """See Source."""
         selection = views.uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
         if count > MAX_SCENES:
@@ -104,9 +100,6 @@ class SceneFolder:
     """The scenes that a folder is or holds, each opened at its first use.
 
     The MAX_OPEN last used stay open.
-
-    Raises:
-        InputError: no scene; and, when a scene is opened, files that cannot be used.
     """
 
     def __init__(self, root: str, options: SceneOptions):
@@ -155,10 +148,6 @@ class FilesSource:
             are not tested, and validation takes every_8th.
         val_scenes: greatest number of scenes that validate.
         targets_may_be_inputs: whether a training task's targets may be among its inputs.
-
-    Raises:
-        InputError: no scene, an index that does not fit, or options that contradict each other;
-            and, when a scene is first used, files that cannot be used.
     """
 
     root: str

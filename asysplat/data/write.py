@@ -21,9 +21,6 @@ def write_transforms(views: Views, folder: Path) -> None:
 
     Cameras as in `describe_cameras`. Depths are 16-bit PNG of thousandths of a scene unit along the
     camera's z axis, 0 where unknown.
-
-    Raises:
-        InputError: views with a batch dimension, or a folder that contains a transforms.json.
     """
     if views.images.ndim != 4:
         raise InputError(
@@ -69,11 +66,7 @@ def describe_cameras(cameras: Cameras, files: Sequence[str]) -> dict[str, Any]:
 
 
 def refuse_inside(folder: Path, data: Path, advice: str) -> None:
-    """Check that `folder` is outside of a data set (its folder, or a file in it).
-
-    Raises:
-        InputError: it is inside; ends with `advice`.
-    """
+    """Check that `folder` is outside of a data set (its folder, or a file in it)."""
     data = (data if data.is_dir() else data.parent).resolve()
     if folder.expanduser().resolve().is_relative_to(data):
         raise InputError(

@@ -46,9 +46,6 @@ def find_backbone(
     Returns:
         `features.N.weight` and `features.N.bias` in fp32, with the values of half precision, so
         that both files give the same numbers; None if the weights were not found.
-
-    Raises:
-        InputError: the file cannot be read or holds other weights, or the download failed.
     """
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if backbone_dir is not None:

@@ -53,9 +53,6 @@ def ssim(
         window: "gaussian": 11x11, sigma 1.5, or "uniform": 7x7.
         covariance: weighted sum of the products of deviations within a window ("biased"), or this
             sum times n / (n - 1) for its n pixels ("sample"), as in scikit-image.
-
-    Raises:
-        InputError: an image is smaller than the window.
     """
     height, width = rendered.shape[-2:]
     check_ssim_size(height, width, window)

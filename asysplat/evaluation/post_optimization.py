@@ -61,9 +61,6 @@ class PostOptimization:
         lpips: as for `Protocol.image_metrics`.
         background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
         backgrounds: scene's name -> background of this scene, where another one is known.
-
-    Raises:
-        InputError: `steps` are not increasing whole numbers from 0 on.
     """
 
     steps: Sequence[int]
@@ -96,9 +93,6 @@ class PostOptimization:
             inputs, targets: the scene's views, without a batch dimension.
             watch: called after each step with the number of steps and, at the steps to measure, the
                 rendering of the targets.
-
-        Raises:
-            InputError: steps that optimize a scene that is not Gaussians.
         """
         background = self.backgrounds.get(scene, self.background)
         if background is None:

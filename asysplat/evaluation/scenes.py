@@ -104,11 +104,7 @@ def measure_scenes(
 
 
 def read_result(path: Path) -> SceneResult:
-    """Read what `save_result` wrote.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Read what `save_result` wrote."""
     try:
         return SceneResult(**read_json(path, errors="strict"))
     except TypeError as error:

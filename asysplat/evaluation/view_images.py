@@ -42,9 +42,6 @@ def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
             named as the view's photograph, or by the view's number in a scene without files. Other
             images in it are ignored.
         tasks: the scenes and their views.
-
-    Raises:
-        InputError: a scene or an image that is missing, twice there, or of no scene.
     """
     option, names = f"images={folder}", {task.sequence.name for task in tasks}
     if not folder.is_dir():
@@ -64,11 +61,7 @@ def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
 
 
 def read_images(paths: Sequence[Path], height: int, width: int) -> ViewImages:
-    """Read images of `height` x `width` pixels.
-
-    Raises:
-        InputError: a damaged file, or one of another size.
-    """
+    """Read images of `height` x `width` pixels."""
     images = []
     for path in paths:
         pixels = torch.tensor(load_image(path))
@@ -83,11 +76,7 @@ def read_images(paths: Sequence[Path], height: int, width: int) -> ViewImages:
 
 
 def view_names(task: Task) -> list[str]:
-    """Return the names of a task's test views: their photographs', or else five-digit numbers.
-
-    Raises:
-        InputError: two photographs of the scene have one name, in different folders.
-    """
+    """Return the names of a task's test views: their photographs', or else five-digit numbers."""
     sequence, targets = task.sequence, task.selection.targets
     if not isinstance(sequence, FileSequence):
         return [f"{index:05d}" for index in targets]

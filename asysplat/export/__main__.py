@@ -46,10 +46,6 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
         output: the new file.
         keep: fraction of the Gaussians, by importance, in (0, 1].
         sh_degree: highest degree of SH; None: the scene's.
-
-    Raises:
-        InputError: see `read_gaussians` and `write_gaussians`; `keep` is out of range, or `output`
-            exists.
     """
     suffix_of(output, WRITERS, "written")
     if not 0 < keep <= 1:

@@ -163,7 +163,6 @@ def orbit(
 def _nearest(
     distances: Float[ndarray, " V"], azimuths: Float[ndarray, " V"], angles: Float[ndarray, " T"]
 ) -> Float[ndarray, " T"]:
-    """Return the smallest distance of the cameras in about the direction of each angle."""
     apart = np.abs((angles[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi)
     alike = apart <= apart.min(1, keepdims=True) + SAME_DIRECTION
     return np.where(alike, distances, np.inf).min(1)
@@ -246,7 +245,6 @@ def _checked_poses(cameras: Cameras, frames: int) -> Float[ndarray, "V 4 4"]:
 
 
 def _with_poses(cameras: Cameras, poses: Float[ndarray, "T 4 4"]) -> Cameras:
-    """Return cameras with other poses and the mean intrinsics."""
     return replace(
         cameras,
         intrinsics=cameras.intrinsics.mean(0).repeat(len(poses), 1, 1),
@@ -262,7 +260,6 @@ def _spread(poses: Float[ndarray, "V 4 4"]) -> float:
 
 
 def _pose_vectors(poses: Float[ndarray, "V 4 4"]) -> Float[ndarray, "V 12"]:
-    """Return vectors whose distances are in spreads, and in radians for small turns."""
     size = _spread(poses)
     centers = poses[:, :3, 3] / size if size else np.zeros((len(poses), 3))
     return np.concatenate((centers, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2)), 1)

@@ -100,11 +100,7 @@ def read_gaussians(
 
 
 def read_notes(path: Path) -> Notes:
-    """Read what a file says besides its Gaussians.
-
-    Raises:
-        InputError: numbers that are not finite, or see the format's reader.
-    """
+    """Read what a file says besides its Gaussians."""
     texts, antialiased = {}, False
     match path.suffix.lower():
         case ".ply":
@@ -166,11 +162,7 @@ def _metadata(notes: Notes) -> dict[str, str]:
 
 
 def suffix_of(path: str | Path, suffixes: Collection[str], verb: str) -> str:
-    """Return which of the suffixes a file has; `verb` says what for, in the message.
-
-    Raises:
-        InputError: none of them.
-    """
+    """Return which of the suffixes a file has; `verb` says what for, in the message."""
     name = Path(path).name.lower()
     for suffix in suffixes:
         if name.endswith(suffix):

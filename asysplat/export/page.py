@@ -107,7 +107,6 @@ def _read(name: str) -> str:
 
 
 def _defines(gaussians: Gaussians, antialiased: bool) -> str:
-    """Return the numbers of the renderer and of the formats as the shaders' constants."""
     floats = asdict(INRIA) | {"color_factor": spz.COLOR_FACTOR}
     floats |= {name: getattr(spherical_harmonics, name) for name in SH_FACTORS}
     integers = {"sh_count": gaussians.sh.shape[-2] - 1, "antialiased": int(antialiased)}

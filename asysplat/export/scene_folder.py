@@ -42,9 +42,6 @@ class SceneFile:
         Returns:
             The Gaussians; the root mean square residual of the fit, as a fraction of the spread of
             the cameras, or None without cameras: the file is then in the data's world.
-
-        Raises:
-            InputError: damaged files; cameras that do not fit.
         """
         cameras = self._cameras()
         if cameras is None:
@@ -106,9 +103,6 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
         scenes: a folder with a file for each scene, named as the scene; or the file of the only
             scene, under any name.
         sequences: the data's scenes.
-
-    Raises:
-        InputError: not exactly one file for every scene, or a file of no scene.
     """
     option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds = f"{', '.join(READERS)}"
@@ -154,9 +148,6 @@ def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitte
         gaussians, cameras: in one frame.
         file: the Gaussians' file, for the message.
         fitted: whether they were moved there by the file's cameras.
-
-    Raises:
-        InputError: they do not.
     """
     with torch.no_grad():
         views = cameras.resized(COVERAGE_SIZE, COVERAGE_SIZE)
@@ -182,7 +173,6 @@ def world_origin(sequence: ImageSequence) -> tuple[float, float, float]:
 
 
 def _unique(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
-    """Return the poses whose name no other has, by name."""
     counts = Counter(name for name, _ in named)
     return {name: pose for name, pose in named if counts[name] == 1}
 

@@ -76,9 +76,6 @@ class Viewer:
         gaussians: [N]; None to `show` them later.
         port: port of this machine; the next free one is used if it is taken; 0: any free one.
         antialiased: see `render`; the panel changes it.
-
-    Raises:
-        InputError: viser is not installed; views or Gaussians with batch dimensions.
     """
 
     def __init__(
@@ -125,9 +122,6 @@ class Viewer:
         """Show other Gaussians, [N], and Markdown in the panel; any thread may call it.
 
         Returns at once.
-
-        Raises:
-            InputError: Gaussians with batch dimensions.
         """
         _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
         # Copied, as kernels run without bounds checks: their inputs must not change meanwhile.

@@ -63,11 +63,7 @@ def clicked_camera(
 
 
 def client_camera(client: PageCamera, max_pixels: int) -> tuple[Cameras, bool]:
-    """Return the camera of a page, and whether it has all pixels of its window.
-
-    Raises:
-        InputError: the client sent numbers that are no camera.
-    """
+    """Return the camera of a page, and whether it has all pixels of its window."""
     height, width = (
         min(max(side, 1), MAX_SIDE) for side in (client.image_height, client.image_width)
     )

@@ -19,9 +19,6 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 
     Args:
         motion: from the Gaussians' frame to the new one.
-
-    Raises:
-        InputError: Gaussians on a device without float64.
     """
     means = to_float64(gaussians.means)
     motion = motion.to(means)

@@ -24,11 +24,7 @@ KERNEL_BACKENDS = ("cpu", "cuda")  # the backends that run kernels; the others a
 def look_up_backend(
     operator: str, backends: Mapping[str, Implementation], backend: str
 ) -> Implementation:
-    """Return the entry of `backends` with the name `backend`.
-
-    Raises:
-        InputError: an unknown name; the message lists the known ones.
-    """
+    """Return the entry of `backends` with the name `backend`."""
     if backend not in backends:
         raise InputError(f"{operator} backend={backend!r}: expected one of {', '.join(backends)}.")
     return backends[backend]
@@ -56,11 +52,7 @@ def load_kernels(operator: str, backend: str) -> ModuleType:
 
 
 def check_kernel_backend(operator: str, backend: str, x: Tensor) -> None:
-    """Check that the kernels of `backend` can run on x.
-
-    Raises:
-        InputError: x is float64 or on another device, or Triton is not installed.
-    """
+    """Check that the kernels of `backend` can run on x."""
     if x.dtype == torch.float64:
         raise InputError(
             f"{operator}'s backend {backend!r} computes in float32 and x is float64: choose "
@@ -107,7 +99,6 @@ def check_float(operator: str, name: str, tensor: Tensor, advice: str = "") -> N
 
 
 def _uses_interpreter(backend: str) -> bool:
-    """Return whether Triton interprets its kernels on a CPU, as in tests."""
     if backend != "cuda" or not find_spec("triton"):
         return False
     import triton

@@ -16,11 +16,7 @@ def without_autocast(tensor: Tensor) -> AbstractContextManager:
 
 
 def to_float64(tensor: Tensor) -> Tensor:
-    """Convert a tensor to float64.
-
-    Raises:
-        InputError: it is on Apple's GPU, which has no float64.
-    """
+    """Convert a tensor to float64."""
     if tensor.device.type == "mps":
         raise InputError(
             "Apple's GPU (mps) has no float64, which cameras and lengths need: move everything to "

@@ -46,9 +46,6 @@ class AsySplat(TokenNetwork):
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
         prior: see TokenNetwork.
-
-    Raises:
-        InputError: an unusable layer mix, patch sizes that do not divide, unequal stage counts.
     """
 
     def __init__(
@@ -162,10 +159,6 @@ def build_asysplat(
         geometry_ratio: between 0 and 1, or None for the given widths.
         parameter_budget: with a ratio, total parameters over those of the given widths.
         components: the other arguments of AsySplat.
-
-    Raises:
-        InputError: a ratio that no widths reach; a budget without a ratio; a count of layers below
-            0 or above MAX_LAYERS.
     """
     if geometry_ratio is None and parameter_budget != 1:
         raise InputError(

@@ -78,9 +78,6 @@ class SparseAttention(nn.Module):
     Args:
         grid: p_g.
         conv_blocks: whether to add the two conv blocks, which connect the grid places of a view.
-
-    Raises:
-        InputError: a grid below 1 or above MAX_GRID.
     """
 
     def __init__(self, shape: StageShape, grid: int = 2, conv_blocks: bool = True):

@@ -15,9 +15,6 @@ class EarlyExit:
     Args:
         skip_layers_above: skip the network's `skippable_layers` from this confidence on.
         skip_network_above: skip the network: the Gaussians are the prior's own.
-
-    Raises:
-        InputError: a threshold is out of range.
     """
 
     skip_layers_above: float | None = None

@@ -32,10 +32,6 @@ def solve_widths(
         layers: N_v, the layers of an appearance stage.
         ratio: parameters of the geometry branch over all.
         budget: total parameters over those of `base` and `layers`.
-
-    Raises:
-        InputError: no model is within 0.015 of the ratio and 1 % of the total; the message names
-            the closest.
     """
     if not 0 < ratio < 1:
         raise InputError(f"geometry_ratio={ratio}: give a fraction between 0 and 1, such as 0.9.")
@@ -132,6 +128,5 @@ def _samples(columns: int) -> np.ndarray:
 
 
 def _count(model: Network) -> tuple[int, float]:
-    """Return the parameters of the model and of its geometry branch."""
     total = sum(p.numel() for p in model.parameters())
     return total, total * model.geometry_ratio()

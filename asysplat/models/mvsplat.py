@@ -35,9 +35,6 @@ class MVSplat(Network):
         planes: number of inverse depths of the volume, equally spaced.
         near, far: least and greatest depth, in units of the normalized scene.
         sh_degree: 0 to 3.
-
-    Raises:
-        InputError: a geometry_ratio or a budget; in `forward`, fewer than 2 views or more than 8.
     """
 
     view_counts = (2, 8)

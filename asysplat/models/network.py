@@ -164,11 +164,7 @@ class TokenNetwork(Network):
         return self.head(self.tokens(pixel_features(views, prior)), views, prior)
 
     def predict_with_early_exit(self, views: Views) -> Gaussians:
-        """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`.
-
-        Raises:
-            InputError: several scenes.
-        """
+        """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`."""
         if len(views.images) != 1:
             raise InputError(
                 f"speed: the network got {len(views.images)} scenes at a time, but early exit "

@@ -20,9 +20,6 @@ class Prune:
     Args:
         prune_ratio: fraction of the Gaussians to drop, in [0, 1).
         random_ratio: fraction of the kept ones that is not chosen by opacity, in [0, 1].
-
-    Raises:
-        InputError: a ratio out of range.
     """
 
     prune_ratio: float

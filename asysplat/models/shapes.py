@@ -49,9 +49,6 @@ class Widths:
         Args:
             stage_ratios: MLP ratio of each stage.
             per_stage: other options with one entry for each stage.
-
-        Raises:
-            InputError: an option has another number of entries.
         """
         for name, values in {"stage_ratios": stage_ratios, **per_stage}.items():
             if len(values) != len(self.stages):

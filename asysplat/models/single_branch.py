@@ -29,10 +29,6 @@ class SingleBranch(TokenNetwork):
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come first in the sequence and have no place.
         prior, prune: see TokenNetwork.
-
-    Raises:
-        InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
-            attention, which needs the tokens' places.
     """
 
     def __init__(
@@ -98,9 +94,6 @@ def build_single_branch(
         width: multiplies the widths.
         geometry_ratio, parameter_budget: must be None and 1: there is one branch.
         components: the other arguments of SingleBranch.
-
-    Raises:
-        InputError: a geometry_ratio or a budget.
     """
     refuse_ratio(geometry_ratio, parameter_budget)
     widths = Widths(tuple(stage_widths), head_dim, head_dim).scaled(width)

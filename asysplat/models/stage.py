@@ -42,9 +42,6 @@ class Stage(nn.Module):
         blocks: letter -> component built from a StageShape, as in conf/model/blocks.yaml.
         merge: whether 2 x 2 tokens become one.
         has_global: whether there are global tokens.
-
-    Raises:
-        InputError: an unusable layer mix.
     """
 
     def __init__(
@@ -104,9 +101,6 @@ def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
     Args:
         mix: counts and letters.
         letters: letters that name a block.
-
-    Raises:
-        InputError: anything else, no layer at all, or more than MAX_LAYERS.
     """
     terms = re.findall(r"(\d{1,3})([a-z])", mix)
     total = sum(int(count) for count, _ in terms)

@@ -69,11 +69,9 @@ _forward.register_autograd(_gradients, setup_context=_save)
 
 @register_flop_formula(torch.ops.asysplat.linear_recurrence)
 def _flops(decay_shape, inputs_shape, *_, **__) -> int:
-    """Count one multiplication and one addition per element."""
     return 2 * torch.Size(inputs_shape).numel()
 
 
 @register_flop_formula(torch.ops.asysplat.linear_recurrence_backward)
 def _backward_flops(decay_shape, states_shape, *_, **__) -> int:
-    """Count the same recurrence from the end, and a multiplication for the decay's gradient."""
     return 3 * torch.Size(states_shape).numel()

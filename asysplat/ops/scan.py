@@ -71,12 +71,7 @@ class Scan:
         self.run_kernels = _register_operator(name, count_flops)
 
     def __call__(self, inputs: ScanInputs, backend: str, reverse: bool) -> Tensor:
-        """Return y in the type of x, scanned from the last token to the first if `reverse`.
-
-        Raises:
-            InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
-                that do not fit together; integers; no token.
-        """
+        """Return y in the type of x, scanned from the last token to the first if `reverse`."""
         self._check(inputs)
         if backend == "auto":
             backend = choose_fastest(inputs.x, "chunked", f"asysplat.ops.self_check:{self.name}")

@@ -98,7 +98,6 @@ def plane_sweep(device: torch.device, backend: str) -> dict[str, float]:
 def _sample_scan(
     draw: Sample, channels: tuple[int, ...], decays: tuple[int, ...], state: int
 ) -> list[Tensor]:
-    """Draw x, dt, A, B, C and D."""
     x, B, C = draw(1, TOKENS, *channels), draw(1, TOKENS, state), draw(1, TOKENS, state)
     dt, A = draw(1, TOKENS, channels[0]).sigmoid(), -draw(*decays).exp()
     return [x, dt, A, B, C, draw(channels[0])]

@@ -23,9 +23,6 @@ def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     Args:
         config: configuration of reconstruct.py; it is left as it is.
         options: names of the options on the command line, which stay.
-
-    Raises:
-        InputError: no finished reconstruction.
     """
     if config.run is None:
         return config

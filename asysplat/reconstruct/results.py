@@ -46,9 +46,6 @@ class Results:
         folder: a new folder is created there.
         config: the configuration.
         per_view: the Gaussians depend on the view, so that no scene file holds them.
-
-    Raises:
-        InputError: an unknown camera path of the video; a folder that cannot be created.
     """
 
     def __init__(self, folder: Path, config: DictConfig, per_view: bool = False):
@@ -77,10 +74,6 @@ class Results:
         """Create the folder and write start.png: renderings before the refinement.
 
         Photographs and background are kept.
-
-        Raises:
-            InputError: images too small to measure; the folder cannot be created or written to, or
-                its disk has no room for the results.
         """
         cameras = photographs.inputs.cameras
         self._protocol.check_size(cameras.height, cameras.width)
@@ -95,11 +88,7 @@ class Results:
         print(f"figure: {self.folder / 'start.png'}")
 
     def save_scene(self, gaussians: Gaussians) -> None:
-        """Write the scene files.
-
-        Raises:
-            InputError: a file cannot be written; the scene is elsewhere then, see `save_gaussians`.
-        """
+        """Write the scene files."""
         photographs, background = self._photographs, self._background.tolist()
         notes = Notes(photographs.origin, background)
         world = photographs.normalization.to_world(gaussians)
@@ -115,11 +104,7 @@ class Results:
             write_page(path, world, cameras, names, Path(self._config.path).name, background)
 
     def save(self, scene: Gaussians | AnchorScene, progress: RefinementProgress) -> None:
-        """Write the scene files, then cameras, the configuration, a contact sheet and metrics.
-
-        Raises:
-            InputError: see `save_scene`.
-        """
+        """Write the scene files, then cameras, the configuration, a contact sheet and metrics."""
         if isinstance(scene, Gaussians):
             self.save_scene(scene)
         self._save_cameras()
@@ -153,7 +138,6 @@ class Results:
                 webbrowser.open(page.absolute().as_uri())
 
     def _save_cameras(self) -> None:
-        """Write the cameras of inputs and held-out views in the world of the scene files."""
         photographs = self._photographs
         files = map(os.path.abspath, photographs.input_files + photographs.held_out_files)
         cameras = photographs.normalization.cameras_to_world(photographs.cameras.to("cpu"))
@@ -219,11 +203,7 @@ class Results:
 
 
 def read_outputs(output: str | Sequence[str]) -> list[str]:
-    """Return the suffixes of the files of a scene that `output` names.
-
-    Raises:
-        InputError: a format that is not written.
-    """
+    """Return the suffixes of the files of a scene that `output` names."""
     names = [output] if isinstance(output, str) else output
     for name in names:
         if f".{name}" not in WRITERS:
@@ -233,12 +213,7 @@ def read_outputs(output: str | Sequence[str]) -> list[str]:
 
 
 def save_gaussians(path: Path, gaussians: Gaussians, notes: Notes = NO_NOTES) -> None:
-    """Write a scene; where that fails, write it elsewhere, as the refinement took long.
-
-    Raises:
-        InputError: the scene is not at `path`; the message names where it is instead: in the folder
-            for temporary files, or else the user's.
-    """
+    """Write a scene; where that fails, write it elsewhere, as the refinement took long."""
     try:
         write_gaussians(path, gaussians, notes)
     except InputError as failure:

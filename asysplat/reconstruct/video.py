@@ -22,11 +22,7 @@ CAMERA_PATHS = ("own", "orbit", "none")
 
 
 def check_video(video: DictConfig) -> None:
-    """Check the options of a video, except for the names of photographs, see `find_views`.
-
-    Raises:
-        InputError: an unknown path, or a number that is out of range.
-    """
+    """Check the options of a video, except for the names of photographs, see `find_views`."""
     height = video.height
     if not (height is None or is_whole(height, 2, MAX_HEIGHT + 1)):
         raise InputError(
@@ -49,9 +45,6 @@ def find_views(video: DictConfig, inputs: Sequence[str], held_out: Sequence[str]
     """Find the views that the camera path passes, in its order, among the inputs and held-out ones.
 
     A photograph is named by its file, or by the end of its path where files share a name.
-
-    Raises:
-        InputError: a name of none of the photographs used, or of several.
     """
     if isinstance(video.path, str):
         return list(range(len(inputs)))

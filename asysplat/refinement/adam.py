@@ -22,9 +22,6 @@ class SelectiveAdam:
         betas: decay of the running averages of a gradient and of its square, in [0, 1).
         eps: > 0, added to the root of the latter.
 
-    Raises:
-        InputError: a tensor that is not of type float32 or float64.
-
     Attributes:
         non_finite: number of visible rows not updated so far, for a NaN or infinite gradient.
     """
@@ -66,9 +63,6 @@ class SelectiveAdam:
                 needs no gradient. A tensor that broadcasts to a row gives the rates of its
                 elements: [K, 1] for the K coefficients of `sh`.
             visible: the rows to update.
-
-        Raises:
-            InputError: a gradient or mask that is missing or has another shape.
         """
         _expect("visible", visible, (self.num_rows,))
         row_rates = {}

@@ -38,10 +38,6 @@ def initial_gaussians(
     Of many views, those of DEPTH_VIEWS, evenly selected. Gaussians of several views on the same
     surface are merged, in cells of a pixel of the network's input or of the prior's depth map, or
     larger ones: `settings.initial_limit`.
-
-    Raises:
-        InputError: `init` is none of INITS, or needs points or depths that the photographs lack, or
-            a network that is not given.
     """
     inputs, pixels = photographs.inputs, 1.0
     views = inputs.select(
@@ -108,9 +104,6 @@ def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussia
     """Place a faint isotropic Gaussian at each sparse point, as Kerbl et al. (2023).
 
     It has the mean color of the point's pixels.
-
-    Raises:
-        InputError: no points, or NaN or infinite coordinates.
     """
     if len(points) == 0 or not points.isfinite().all():
         raise InputError(

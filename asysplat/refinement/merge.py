@@ -57,9 +57,6 @@ def merge_to_limit(
     """Merge Gaussians in cells of `pixels`, then larger ones until few enough are left.
 
     `pixels`, > 0, is the side of a cell in pixels of the view where these are smallest.
-
-    Raises:
-        InputError: see `Gaussians.validate`; Gaussians on a device without float64.
     """
     gaussians.validate("merge_to_limit's gaussians")
     cells = pixels * footprints(gaussians.means, cameras)

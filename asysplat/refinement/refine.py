@@ -66,10 +66,6 @@ class Refinement:
         background: RGB; None: the mean color of the views.
         settings: what is optimized, and how.
         seed: seed of the order of views and of new Gaussians.
-
-    Raises:
-        InputError: no Gaussians, invalid values, views on another device, or a kind of
-            densification that needs float64 on a device without it.
     """
 
     def __init__(
@@ -168,7 +164,6 @@ class Refinement:
         self.fields.reset_opacities(MAX_RESET_OPACITY)
 
     def _next_count(self, number: int) -> int:
-        """Return the number of Gaussians after a round, on an even growth to the limit."""
         count, remaining_rounds = len(self.fields), self.settings.densify_rounds - number + 1
         return round(count * (self._max_gaussians / count) ** (1 / max(1, remaining_rounds)))
 

@@ -43,11 +43,7 @@ SEEN_OFTEN = 0.8  # fraction of a round in which an anchor must be seen; half of
 
 @dataclass(frozen=True)
 class ScaffoldSettings:
-    """Settings of a refinement by Scaffold-GS; the defaults are those published.
-
-    Raises:
-        InputError: a number out of range.
-    """
+    """Settings of a refinement by Scaffold-GS; the defaults are those published."""
 
     voxel: float = 1e-3  # side of the cells that hold an anchor, by the farthest camera's distance
     max_gaussians: int | None = None  # ten for each anchor; None: no limit
@@ -363,9 +359,6 @@ def refine_scaffold(
         gaussians, views, background, seed, watch: see `asysplat.refinement.refine`.
         settings: settings of the cells and of growth.
         seconds, steps: give one of them.
-
-    Raises:
-        InputError: neither seconds nor steps, or both; no Gaussians; invalid values.
     """
     budget = read_budget(seconds, steps)
     if gaussians.num_gaussians == 0:
@@ -382,7 +375,6 @@ def refine_scaffold(
 
 
 def _new_anchors(sizes: Float[Tensor, "N"]) -> Parameters:
-    """Return the parameters of new anchors of these sizes."""
     return {
         "offsets": sizes.new_zeros(len(sizes), OFFSETS, 3),
         "features": sizes.new_zeros(len(sizes), FEATURES),

@@ -32,9 +32,6 @@ def draw_in_chunks(
 
     If memory is too small, try half as many, with a warning. With `centers`, which receives the
     gradients of the splats' centers, all are drawn at once.
-
-    Raises:
-        InputError: views_at_once below 1, or with centers.
     """
     if views_at_once is not None and views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
@@ -126,6 +123,5 @@ class _Deferred(torch.autograd.Function):
 
 
 def _select(tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
-    """Select the inputs for some views."""
     *fields, poses, intrinsics = tensors
     return [*fields, poses[:, views], intrinsics[:, views]]

@@ -108,9 +108,6 @@ class RenderSettings:
         antialiased: lower the opacity by what eps2d adds to a splat's area (Yu et al. 2024).
         depth: one of DEPTHS, or None.
         culling: exact culling.
-
-    Raises:
-        InputError: an unknown depth.
     """
 
     limits: BlendingLimits = INRIA

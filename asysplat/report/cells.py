@@ -72,7 +72,6 @@ def make_overview(tables: Sequence[PaperTable]) -> Grid:
 
 
 def _networks(filled: PaperTable) -> list[PaperRow]:
-    """List the rows without post-optimization, which changes no cost of the network."""
     return [row for row in filled.rows if not row.post_optimization]
 
 
@@ -171,7 +170,6 @@ def _claim_grid(claims: Sequence[Claim]) -> Grid:
 
 
 def _least(row: PaperRow, key: str) -> Number | None:
-    """Return the paper's number, or the bound that it prints in place of one."""
     return float(row.bounds[key][1:]) if key in row.bounds else row.numbers.get(key)
 
 

@@ -285,7 +285,6 @@ def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> str:
 
 
 def _folders(runs: Sequence[Run]) -> str:
-    """Write the names of the folders of the runs' data."""
     keys = ("run/data/root", "run/data/test_root")
     of_runs = {" and ".join(run.results[k] for k in keys if k in run.results) for run in runs}
     folders = sorted(of_runs - {""})

@@ -161,11 +161,7 @@ def load_claims() -> PaperTable:
 
 
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
-    """Find tables of the paper, "claims" or ours by name: one, several with commas, or "all".
-
-    Raises:
-        InputError: a name that no table has, with the nearest ones.
-    """
+    """Find tables of the paper, "claims" or ours by name: one, several with commas, or "all"."""
     tables = load_paper() | {"claims": load_claims()} | load_paper("ours")
     names = names.split(",") if isinstance(names, str) else list(names)
     if names == ["all"]:

@@ -66,9 +66,6 @@ def report_runs(folder: Path, output: Path | None = None) -> None:
     Args:
         folder: searched recursively; what is behind links is not read.
         output: the page, .html, or the folder of index.html; None: `folder`.
-
-    Raises:
-        InputError: no such folder, no finished reconstruction, or a page that cannot be written.
     """
     if not folder.is_dir():
         raise InputError(f"runs={folder} is no folder: name one that holds reconstructions.")
@@ -93,7 +90,6 @@ def report_runs(folder: Path, output: Path | None = None) -> None:
 
 
 def _check_own(page: Path) -> None:
-    """Raise InputError if there is a page that another program or a person wrote."""
     if not page.is_file():
         return
     with page.open("rb") as file:

@@ -98,5 +98,4 @@ def _describe(run: Run) -> str:
 
 
 def _letters(name: str) -> str:
-    """Return the letters and digits of a name up to its first comma, in lower case."""
     return re.sub(r"[^a-z0-9]", "", name.partition(",")[0].lower())

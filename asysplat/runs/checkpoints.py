@@ -38,9 +38,6 @@ def find_checkpoint(
         run: the run's own folder; if it or one of its stages has checkpoints, it was interrupted.
         runs: folder of all runs of one name.
         say: takes the path, and warnings.
-
-    Raises:
-        InputError: there is no such file, or it is damaged, and so is the one before it.
     """
     if any(has_checkpoints(folder) for folder in (run, *run.glob("*/"))):
         path = newest_folder(run) / "checkpoints" / LAST
@@ -68,11 +65,7 @@ def has_checkpoints(folder: Path) -> bool:
 
 
 def newest_folder(runs: Path) -> Path:
-    """Return the folder, `runs` or below, with the newest checkpoint to resume from.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the folder, `runs` or below, with the newest checkpoint to resume from."""
     paths = [path for name in (LAST, PREVIOUS) for path in runs.rglob(f"checkpoints/{name}")]
     if not paths:
         raise InputError(
@@ -98,9 +91,6 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """Read the metadata of a run's checkpoint; its weights stay on the disk.
 
     `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names.
-
-    Raises:
-        InputError: the file cannot be read as a run's checkpoint.
     """
     try:
         metadata = torch.load(path, map_location="meta", mmap=True, weights_only=True)
@@ -127,11 +117,7 @@ def config_diff(metadata: Mapping[str, Any], config: Mapping[str, Any], revision
 
 
 def check_checkpoint(path: Path, module: nn.Module) -> None:
-    """Check the names and shapes of the weights before training.
-
-    Raises:
-        InputError: the file cannot be read, or holds the weights of another model.
-    """
+    """Check the names and shapes of the weights before training."""
     try:
         if path.suffix == ".safetensors":
             with safe_open(path, "pt") as file:
@@ -169,11 +155,7 @@ def check_checkpoint(path: Path, module: nn.Module) -> None:
 
 
 def build_within(model: DictConfig, checkpoint: Path) -> Network:
-    """Build the network of a run, whose sizes may be a stranger's: first without memory.
-
-    Raises:
-        InputError: it is no network, or has more weights than the checkpoint has bytes.
-    """
+    """Build the network of a run, whose sizes may be a stranger's: first without memory."""
     with torch.device("meta"):
         planned = instantiate(model)
     if not isinstance(planned, Network):
@@ -193,9 +175,6 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
         path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
         module: module to load into.
         option: option that named the path, for messages.
-
-    Raises:
-        InputError: there is no such file, it is damaged, or it does not fit.
     """
     if path is None:
         return
@@ -231,11 +210,7 @@ def existing_weights(path: str, option: str = "init_path") -> Path:
 
 
 def atomic_save(values: object, path: Path) -> None:
-    """Write values atomically with torch.save.
-
-    Raises:
-        InputError: the disk is full or the folder is not writable.
-    """
+    """Write values atomically with torch.save."""
     with atomic_write(path) as partial, open(partial, "wb") as file:
         try:
             torch.save(values, file)

@@ -9,11 +9,7 @@ NO_APPLE_GPU = "is not supported: Apple's GPU has no float64, which cameras need
 
 
 def find_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the GPU where there is one, unless it is Apple's.
-
-    Raises:
-        InputError: another name, or a GPU where there is none.
-    """
+    """Return a device by name; "auto" is the GPU where there is one, unless it is Apple's."""
     if name == "mps":
         raise InputError(f"device=mps {NO_APPLE_GPU} device=cpu.")
     if name not in NAMES:
@@ -24,11 +20,7 @@ def find_device(name: str) -> torch.device:
 
 
 def find_accelerator(name: str) -> str:
-    """Return Lightning's accelerator called `name`; "auto" is the CPU where the GPU is Apple's.
-
-    Raises:
-        InputError: Apple's GPU.
-    """
+    """Return Lightning's accelerator called `name`; "auto" is the CPU where the GPU is Apple's."""
     apple = torch.backends.mps.is_available() and not torch.cuda.is_available()
     if name == "mps" or (name == "gpu" and apple):
         raise InputError(f"trainer.accelerator={name} {NO_APPLE_GPU} trainer.accelerator=cpu.")

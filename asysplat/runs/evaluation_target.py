@@ -45,13 +45,7 @@ class EvaluationTarget:
 
 
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
-    """Find the target of evaluate.py from its options and the overrides of its command.
-
-    Raises:
-        InputError: none of SOURCES is given, or several are; files do not exist, or are in a format
-            that loses the scene; options that do not go together; a value that is missing or out of
-            range.
-    """
+    """Find the target of evaluate.py from its options and the overrides of its command."""
     sources = [name for name in SOURCES if options.get(name) is not None]
     if len(sources) != 1:
         raise InputError(
@@ -147,7 +141,6 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
 
 
 def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
-    """Describe what results depend on, under keys of the evaluation."""
     described = describe_run(config)
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
     described["evaluation/post_optimization_steps"] = str(options.post_optimization_steps)

@@ -97,11 +97,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
 
 
 def check_ranges(config: DictConfig) -> None:
-    """Check the options of `RANGES` that the configuration has.
-
-    Raises:
-        InputError: a value has the wrong type or is out of range.
-    """
+    """Check the options of `RANGES` that the configuration has."""
     absent = object()
     for expected, fits, keys in RANGES:
         for key in keys:

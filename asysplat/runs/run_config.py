@@ -29,10 +29,6 @@ def read_config(path: Path) -> DictConfig:
     Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted, and
     for a model, which holds no data and no logger, those of conf/model/. A cache and downloads are
     not the run's to choose: there is no cache, and nothing is downloaded.
-
-    Raises:
-        InputError: the file cannot be read, has a `_target_` that none of these files has, values
-            without names, or an interpolation, which could hide any.
     """
     text = read_text(path, MAX_BYTES, "strict")
     try:
@@ -53,11 +49,7 @@ def read_config(path: Path) -> DictConfig:
 
 @contextmanager
 def using_config(path: Path) -> Generator[None]:
-    """Name a run's config.yaml in the errors of what is built from it, which are of many kinds.
-
-    Raises:
-        InputError: any of them.
-    """
+    """Name a run's config.yaml in the errors of what is built from it, which are of many kinds."""
     try:
         yield
     except Exception as error:

@@ -25,9 +25,6 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
 
     An interrupted run resumes in its own folder. Other runs that start from a checkpoint, such as
     more steps of a finished run, get the folder `new`. `runs` has all runs of one name.
-
-    Raises:
-        InputError: the folder to resume in has links, through which Hydra would write.
     """
     if ckpt_path == "last":
         try:

@@ -214,9 +214,6 @@ def folder_of(
         logs: folder in which "last" is searched.
         find: function that returns the folders of the finished runs below a folder, oldest first.
         files: names of files that the folder must have.
-
-    Raises:
-        InputError: no finished run, or a file is missing.
     """
     folder = Path(str(run))
     if run == "last":

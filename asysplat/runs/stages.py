@@ -20,9 +20,6 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
 
     Optimizer, schedule and random numbers start anew in each stage. All are tested at the size of
     the last, so that their numbers can be compared.
-
-    Raises:
-        InputError: `earlier_stages` has a stage that the scale does not have, or a stage twice.
     """
     names = [*(config.get("earlier_stages") or ()), config.stage]
     size = config.data.test_size or [config.data.height, config.data.width]
@@ -46,12 +43,7 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
 
 
 def check_stages(stages: Sequence[DictConfig]) -> None:
-    """Check the options of every stage, so that none is refused after days of training.
-
-    Raises:
-        InputError: a value out of range, a size that the model does not take, or several stages
-            without checkpoints.
-    """
+    """Check the options of every stage, so that none is refused after days of training."""
     if len(stages) == 1:
         check_ranges(stages[0])
         return
@@ -81,9 +73,6 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
     """Find where a run resumes: the index of the checkpoint's stage, and the results before it.
 
     A checkpoint without the name of a stage counts as one of the first.
-
-    Raises:
-        InputError: the file cannot be read, or is of a stage that the run does not have.
     """
     if checkpoint is None:
         return 0, {}

@@ -43,12 +43,7 @@ def write_json(path: Path, results: Results) -> None:
 
 
 def read_results(path: Path) -> Results:
-    """Read what `write_json` wrote, under today's names; it may be a stranger's.
-
-    Raises:
-        InputError: it is missing or damaged, or a value is of another type than is written, or a
-            number of more than MAX_NUMBER.
-    """
+    """Read what `write_json` wrote, under today's names; it may be a stranger's."""
     results = read_json(path, MAX_BYTES, "strict")
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")

@@ -71,11 +71,7 @@ class TrainingStage:
     def check(
         self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
     ) -> None:
-        """Check that data, model and metrics fit each other.
-
-        Raises:
-            InputError: a size or a number of views does not fit the model.
-        """
+        """Check that data, model and metrics fit each other."""
         net = module.net
         net.check_early_exit(early_exit)
         data.check_sizes(net.check_size)
@@ -87,9 +83,6 @@ class TrainingStage:
 
         A stage that is resumed drops the events that it logged after the checkpoint, since it will
         log them again.
-
-        Raises:
-            InputError: the weights do not fit the model.
         """
         load_weights(self.weights, module)
         _say(f"{self.config.stage}: {describe_stage(self.config)}")
@@ -102,11 +95,7 @@ class TrainingStage:
         cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
-        """Return the trainer's arguments that conf/trainer does not have, and its accelerator.
-
-        Raises:
-            InputError: Apple's GPU.
-        """
+        """Return the trainer's arguments that conf/trainer does not have, and its accelerator."""
         return {
             "accelerator": find_accelerator(self.config.trainer.accelerator),
             "callbacks": [*callbacks.values(), StageRecord(self.config.stage, self.earlier)],
@@ -121,9 +110,6 @@ class TrainingStage:
         """Divide the batches between the processes, and write config.yaml.
 
         The last check is before it: an option that is refused leaves no folder.
-
-        Raises:
-            InputError: the devices cannot divide a batch.
         """
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
@@ -137,11 +123,7 @@ class TrainingStage:
 
     @contextmanager
     def resuming(self, trainer: lightning.Trainer) -> Generator[None]:
-        """Name the checkpoint in an error before the first step, which is of restoring it.
-
-        Raises:
-            InputError: another version wrote it, or it was changed.
-        """
+        """Name the checkpoint in an error before the first step, which is of restoring it."""
         try:
             yield
         except Exception as error:
@@ -156,11 +138,7 @@ class TrainingStage:
 
 
 def instantiate_option(config: DictConfig, key: str, **arguments: object) -> Any:
-    """Instantiate `config[key]`, an object of a library.
-
-    Raises:
-        InputError: the library refuses an option, or is not installed.
-    """
+    """Instantiate `config[key]`, an object of a library."""
     try:
         return instantiate(config[key], **arguments)
     except InstantiationException as error:
@@ -200,12 +178,7 @@ class PreparedRun:
 
 @contextmanager
 def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
-    """Check a configuration, lock the run's folder and find the stages that are to be trained.
-
-    Raises:
-        InputError: an option is missing or out of range, the accelerator is Apple's GPU, another
-            process trains in the folder, or a checkpoint cannot be used.
-    """
+    """Check a configuration, lock the run's folder and find the stages that are to be trained."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     without_missing_network(config)
@@ -231,11 +204,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
 
 
 def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None) -> None:
-    """Check that the file to resume or start from fits the model, before any scene is made.
-
-    Raises:
-        InputError: there is no such file, or it holds the weights of another model.
-    """
+    """Check that the file to resume or start from fits the model, before any scene is made."""
     file = existing_weights(weights) if weights is not None else checkpoint
     if file is not None:
         with torch.device("meta"):
@@ -247,9 +216,6 @@ def without_missing_network(config: DictConfig) -> None:
     """Set the weight of the perceptual term to 0 if its network is not on this machine.
 
     The run is then hashed and recorded as what it is, a run without the term.
-
-    Raises:
-        InputError: `allow_missing_losses` is off.
     """
     loss = config.training.loss
     if loss.perceptual:

@@ -159,6 +159,5 @@ def estimate(
 
 
 def _mean_of_largest(values: torch.Tensor, block: int) -> float:
-    """Return the mean of the largest value of each program, for which all of its lanes wait."""
     padded = torch.nn.functional.pad(values, (0, -len(values) % block))
     return float(padded.unflatten(0, (-1, block)).amax(1).double().mean())

@@ -78,7 +78,6 @@ def _recording() -> Iterator[tuple[list[Launch], list[Callable]]]:
 
 
 def _keep_one_pair(arguments: dict[str, Any]) -> None:
-    """Leave every Gaussian with one pair of splat and tile."""
     for name, value in arguments.items():
         if name in ("depths", "counts"):
             value.fill_(1)

@@ -36,9 +36,6 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": for each capability and kernel, what a thread and a block take, and instructions;
         "estimates": for each card of these capabilities, the seconds of the renderer's kernels.
-
-    Raises:
-        InputError: no Triton; capabilities that are not known, or none.
     """
     if not find_spec("triton"):
         raise InputError("suite=machine_code needs Triton, which comes with torch on Linux.")

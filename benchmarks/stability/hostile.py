@@ -70,7 +70,6 @@ def _in_a_line(spacing: float, camera: Cameras, count: int) -> Cameras:
 
 
 def _upside_down(camera: Cameras, count: int) -> Cameras:
-    """Turn every other camera on the arc upside down."""
     cameras = _handheld(camera, count)
     turn = torch.eye(4).repeat(count, 1, 1)
     turn[1::2, 0, 0] = turn[1::2, 1, 1] = -1
@@ -124,7 +123,6 @@ def hostile_gaussians(name: str, gaussians: Gaussians, cameras: Cameras) -> Gaus
 
 
 def _behind(gaussians: Gaussians, cameras: Cameras) -> dict[str, Tensor]:
-    """Mirror half of the means behind the first camera, and move a tenth into it."""
     means = gaussians.means.clone()
     means[::2] = 2 * cameras.centers[0] - means[::2]
     means[::10] = cameras.centers[0]

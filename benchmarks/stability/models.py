@@ -59,7 +59,6 @@ def _cameras(tensors: Tensors) -> Cameras:
 
 
 def _plane_sweep(tensors: Tensors) -> Tensors:
-    """Compute the confidence, and the product of confidence and normalized inverse depth."""
     depth = plane_sweep(tensors["images"], _cameras(tensors))
     inverse = depth.inverse_depth / depth.inverse_depth.max().clamp_min(MIN_INVERSE_DEPTH)
     weighted = depth.confidence * inverse

@@ -63,7 +63,6 @@ def operator_cases() -> Iterator[StabilityCase]:
 def _compare(
     operator: Callable, output: str, inputs: Tensors, leaves: tuple[str, ...], **options
 ) -> Result:
-    """Compare the default backend of an operator with the reference."""
     fast, exact = (
         lambda tensors, backend=backend: {output: operator(**tensors, backend=backend)}
         for backend in ("auto", "reference")

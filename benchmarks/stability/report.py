@@ -65,9 +65,6 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each case, with "area", "case", "precision" and the values of
         `comparison.make_row`.
-
-    Raises:
-        InputError: an area or model is unknown, or a number is below 1.
     """
     options = options.stability
     check_names("stability.areas", options.areas, AREAS)

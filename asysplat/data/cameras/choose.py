@@ -29,9 +29,6 @@ class CameraOptions:
         where: folder of found and refined cameras.
         frames: greatest number of frames of a video.
         console: console that shows the progress; None shows none.
-
-    Raises:
-        InputError: another choice.
     """
 
     choice: str = "given"

@@ -79,10 +79,6 @@ def find_cameras(
         frames: greatest number of frames of a video, each the sharpest of an equal part.
         on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
         console: console that shows the progress; None shows none.
-
-    Raises:
-        InputError: no photographs, fewer than 3 `frames`, a photograph that cannot be read, `where`
-            cannot be written to or is too full, or too few that show the same place.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:

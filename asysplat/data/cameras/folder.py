@@ -28,11 +28,7 @@ ONLY_FATAL = 3  # the least severe messages that are printed
 def work_folder(
     where: Path, photographs: int, console: Console | None
 ) -> Generator[tuple[Path, Progress]]:
-    """Yield a temporary folder in `where` with an empty images/, and progress bars; quiet COLMAP.
-
-    Raises:
-        InputError: `where` cannot be written to, or has too little space for so many photographs.
-    """
+    """Yield a temporary folder in `where` with images/, and progress bars; quiet COLMAP."""
     make_folder(where, "paths.logs")
     check_room(where, photographs * BYTES_PER_PHOTOGRAPH)  # without it, COLMAP ends the process
     before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, ONLY_FATAL

@@ -156,9 +156,6 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
         scene: returned by a reader.
         bad: the damaged images that the reader found; those found here are added.
         console: where to show progress bars; None shows none.
-
-    Raises:
-        InputError: too few usable images, or damaged images that must not be skipped.
     """
     if not scene.images:
         bad.report(scene.name, 0)

@@ -110,7 +110,6 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
 
 
 def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
-    """Return right, ahead and (mean) up as columns, from the first camera's right axis."""
     rotations = cameras.cam_to_world[:, :3, :3].double().numpy()
     up, right = -rotations[:, :, 1].mean(0), rotations[0, :, 0]
     ahead = np.cross(up, right)
@@ -119,7 +118,6 @@ def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
 
 
 def _limits(centers: Float[ndarray, " N"], points: Float[ndarray, " P"]) -> tuple[float, float]:
-    """Return the limits of an axis that includes all cameras and most points."""
     values = [*centers, *(np.quantile(points, POINT_QUANTILES) if len(points) else ())]
     margin = MARGIN * max(max(values) - min(values), 1e-6)
     return min(values) - margin, max(values) + margin

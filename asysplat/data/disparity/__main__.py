@@ -66,11 +66,7 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
 def write_maps(
     layout: str, scene: Path, folder: Path, estimate: Estimate, bad: BadImages
 ) -> tuple[int, int]:
-    """Write the missing maps of one scene; return the numbers of written and of existing maps.
-
-    Raises:
-        InputError: files that cannot be read or written; the maps written before stay.
-    """
+    """Write the missing maps of one scene; return the numbers of written and of existing maps."""
     posed = read_scene(layout, scene, bad)
     try:
         folder.mkdir(parents=True, exist_ok=True)

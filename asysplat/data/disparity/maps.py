@@ -52,9 +52,6 @@ def write_map(path: Path, disparity: Float[ndarray, "h w"]) -> None:
 
     Scale and shift are not stored, since the loss ignores them; 0 means unknown. The file appears
     complete or not at all.
-
-    Raises:
-        InputError: NaN or infinity; a file that cannot be written.
     """
     if not np.isfinite(disparity).all():
         raise InputError(f"{path} would hold NaN or infinity: name another --model.")

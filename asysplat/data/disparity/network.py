@@ -55,10 +55,6 @@ def load_depth_anything(model: str, download: bool) -> DepthAnything:
     Args:
         model: a folder, or a name on the Hugging Face Hub.
         download: whether to download missing weights.
-
-    Raises:
-        InputError: transformers is not installed, weights are missing, or they are for metric
-            depth.
     """
     try:
         # Extra that is missing where types are checked.

@@ -88,7 +88,6 @@ class Boxes(Solids):
         return self.halves.norm(dim=1)
 
     def _to_centers(self, points: Points) -> Float[Tensor, "3 B R"]:
-        """Return the offsets from each point to each box's center, along the box's axes."""
         centers = torch.einsum("bij,bj->ib", self.axes, self.centers).reshape(-1, 1)
         offsets = torch.addmm(centers, self._axes_first(), points, alpha=-1)
         return offsets.view(3, len(self.centers), points.shape[1])

@@ -103,7 +103,6 @@ def _near_middle(rng: Generator, time: Times, amplitude: float) -> Points:
 
 
 def _at_hand_height(rng: Generator, time: Times, ground: Float[np.ndarray, "2 T"]) -> Points:
-    """Lift ground positions to a camera held anywhere from chest to eyes."""
     return np.stack((*ground, rng.uniform(1.1, 1.65) + 0.06 * sway(rng, time, 1.0, 2.3)), 1)
 
 

@@ -31,11 +31,7 @@ BRIGHTNESS = -0.2  # mean of the same
 
 
 def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
-    """Return the seed of scene `index` of a split: every third number, so that splits are disjoint.
-
-    Raises:
-        InputError: unknown split or negative index.
-    """
+    """Return the seed of a scene: every third number, so that splits are disjoint."""
     if split not in SPLITS:
         raise InputError(f"split is {split!r}: expected one of {', '.join(SPLITS)}.")
     if index < 0:
@@ -58,9 +54,6 @@ class ProceduralScene:
         places: rooms or outdoors; with both, the seed decides.
         varied: adds thin and small near objects, gloss, antialiased edges, more kinds of camera
             paths, and focal lengths from wide to long.
-
-    Raises:
-        InputError: unknown places, too many images, or images that are too large.
     """
 
     def __init__(

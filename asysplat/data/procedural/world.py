@@ -199,7 +199,6 @@ class World:
 
 
 def _padded_rays(mask: Bool[Tensor, " R"]) -> Index:
-    """Return the indices of the rays in the mask, the last repeated up to a whole block."""
     rays = mask.nonzero()[:, 0]
     # Torch sums the end of a row in another order; padding keeps every ray's rounding the same.
     return torch.cat((rays, rays[-1:].expand(-len(rays) % BLOCK)))

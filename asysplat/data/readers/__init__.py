@@ -64,11 +64,7 @@ def _file_errors(path: Path) -> Generator[None]:
 
 
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
-    """Return the layout of the scenes that `root` is or holds, and the scenes.
-
-    Raises:
-        InputError: an unknown layout, or no scene.
-    """
+    """Return the layout of the scenes that `root` is or holds, and the scenes."""
     _check_layout(layout)
     root = Path(root).absolute()
     for name in LAYOUTS if layout == "auto" else (layout,):
@@ -120,9 +116,6 @@ def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
     """Read one of the `find_scenes` with its images' masks, and panoramas as their faces.
 
     Errors of single images are collected.
-
-    Raises:
-        InputError: a scene that is not usable.
     """
     with _file_errors(scene):
         if scene.is_dir():
@@ -146,9 +139,6 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
 
     Args:
         scene: folder of the scene, or a path that `find_scenes` returned.
-
-    Raises:
-        InputError: files that cannot be used, or fewer than two images.
     """
     path, layout = Path(scene).absolute(), options.layout
     _check_layout(layout)

@@ -42,9 +42,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     The names are relative to the first of FOLDERS that holds the most of them. Reads the registered
     images, ordered by the numbers in their names (2 before 10); a warning lists images that are not
     registered. Where images are smaller than their cameras' size, the intrinsics are scaled.
-
-    Raises:
-        InputError: a model that cannot be used, or images that are not there.
     """
     model = _find_model(scene)
     if model is None:
@@ -80,9 +77,6 @@ def read_model_points(scene: Path, posed: Sequence[PosedImage]) -> Points | None
 
     None if there is no model, or if its poses of the images with the same names differ: then its
     world is another one.
-
-    Raises:
-        InputError: a model that is cut short.
     """
     if (model := _find_model(scene)) is None:
         return None

@@ -22,11 +22,7 @@ MAX_LINE = 2**26  # bytes of a line of text: a photograph with two million match
 
 
 def read_model(model: Path) -> pycolmap.Reconstruction:
-    """Read a model; without its tracks, and with a warning, if these contradict its points.
-
-    Raises:
-        InputError: files that are missing, cut short or damaged, or an unknown camera model.
-    """
+    """Read a model; without its tracks, and with a warning, if these contradict its points."""
     binary = (model / "cameras.bin").is_file()
     files = _files(model, ".bin" if binary else ".txt")
     entries = {file: _entries(file) for file in files} if binary else {}
@@ -76,11 +72,7 @@ def _files(model: Path, suffix: str) -> list[Path]:
 
 
 def check_lines(file: Path) -> None:
-    """Check that a text has no line so long that it is none of COLMAP's, which is read whole.
-
-    Raises:
-        InputError: a part of MAX_LINE bytes has no end of a line.
-    """
+    """Check that a text has no line so long that it is none of COLMAP's, which is read whole."""
     with file.open("rb") as parts:
         while part := parts.read(MAX_LINE):
             if len(part) == MAX_LINE and b"\n" not in part:
@@ -102,9 +94,6 @@ def _entries(file: Path) -> list[tuple[int, int]]:
 
     The fixed part of an image or a point ends before the count of its matches. COLMAP itself loops
     for ever in a file cut short.
-
-    Raises:
-        InputError: the counts in the file disagree with its length.
     """
     entries, end = [], 8
 

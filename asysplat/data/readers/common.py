@@ -57,11 +57,7 @@ def natural_order(path: Path) -> list[str | tuple[int, str]]:
 
 
 def read_frames(file: Path) -> dict[str, Any]:
-    """Read a JSON object with a list "frames".
-
-    Raises:
-        InputError: no JSON, or no list "frames".
-    """
+    """Read a JSON object with a list "frames"."""
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file} has no list "frames": give one entry for each image.')
@@ -74,22 +70,14 @@ def has_path(entry: object) -> bool:
 
 
 def frame_label(file: Path, index: int, entry: Any) -> str:
-    """Return the name of an entry of "frames" for messages.
-
-    Raises:
-        InputError: the entry has no file_path.
-    """
+    """Return the name of an entry of "frames" for messages."""
     if not has_path(entry):
         raise InputError(f"{file}, frame {index} has no file_path: name its image.")
     return f"{file}, frame {index} ({entry['file_path']})"
 
 
 def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return the number under `key`, or `default` where there is none.
-
-    Raises:
-        InputError: it is no finite number.
-    """
+    """Return the number under `key`, or `default` where there is none."""
     value = settings.get(key, default)
     if not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
         raise InputError(f"{where}: {key} is {repr(value)[:80]}: give a finite number.")
@@ -104,11 +92,7 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
-    """Scale a lens to an image of another size and the same field of view.
-
-    Raises:
-        InputError: intrinsics of no lens, or an image of other proportions.
-    """
+    """Scale a lens to an image of another size and the same field of view."""
     # Integers from JSON may be too large for a float.
     (width, height), lens_size = size, (min(lens.width, 10**9), min(lens.height, 10**9))
     numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(lens_size)
@@ -135,11 +119,7 @@ def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
 
 
 def refuse_turned(size: tuple[int, int], lens_size: tuple[int | float, int | float]) -> None:
-    """Check that an image is not stored turned against intrinsics for `lens_size`.
-
-    Raises:
-        InputError: it is; the message is the same for all images, and shown once.
-    """
+    """Check that an image is not stored turned against intrinsics for `lens_size`."""
     if lens_size == size[::-1] and lens_size != size:
         raise InputError(
             f"photographs are stored as {size[0]} x {size[1]}, with an orientation tag, and their "
@@ -149,11 +129,7 @@ def refuse_turned(size: tuple[int, int], lens_size: tuple[int | float, int | flo
 
 
 def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
-    """Return the path of a depth map or mask, after checking that it shows the whole image.
-
-    Raises:
-        InputError: its proportions are not the image's.
-    """
+    """Return the path of a depth map or mask, after checking that it shows the whole image."""
     width, height = image_size(path)
     if not same_proportions((width, height), size):
         raise InputError(
@@ -172,11 +148,7 @@ def to_array(stored: object) -> Float[ndarray, "..."]:
 
 
 def check_rigid(stored: object, where: str) -> Float[ndarray, "4 4"]:
-    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal.
-
-    Raises:
-        InputError: another shape, numbers that float32 cannot hold, or scale, shear or mirroring.
-    """
+    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
     matrix = to_array(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")

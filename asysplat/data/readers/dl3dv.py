@@ -40,9 +40,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a scene's folder, or the `nerfstudio` in it: at 960P, else at the available size.
 
     The intrinsics are for the video's size (w x h in the file) and are scaled to the images'.
-
-    Raises:
-        InputError: files that are missing or cannot be used.
     """
     folder = _content(scene)
     images = _images(folder)
@@ -64,7 +61,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
 
 def _content(scene: Path) -> Path:
-    """Return the folder in which a scene's files lie."""
     inner = scene / BENCHMARK
     return inner if (inner / TRANSFORMS).is_file() else scene
 

@@ -34,9 +34,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     height, width and focal length of the full-size image, then the nearest and farthest depth. The
     principal point is the center. Images are taken from the first of `images`, `images_2`,
     `images_4` and `images_8` that holds one image per row.
-
-    Raises:
-        InputError: an array of another shape, or no folder with one image for each row.
     """
     file = scene / POSES
     try:

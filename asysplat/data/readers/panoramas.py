@@ -17,11 +17,7 @@ YAWS = (0.0, 90.0, 180.0, 270.0)
 
 
 def panorama(width: int, height: int, where: str) -> Lens:
-    """Return the lens of a whole panorama.
-
-    Raises:
-        InputError: it is not twice as wide as high.
-    """
+    """Return the lens of a whole panorama."""
     if not same_proportions((width, height), (2, 1)):
         raise InputError(
             f"{where} is {PANORAMA} and {width} x {height}: give panoramas of all directions, "

@@ -41,9 +41,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     `poses_refined.txt` if there is one, belongs to the i-th image in sorted order: camera-to-world
     4x4, row-major, OpenCV axes, meters. Depth maps have the images' names, as one-channel PNG of
     millimeters along z, 0 where unknown.
-
-    Raises:
-        InputError: a matrix that cannot be used, or other numbers of poses and images.
     """
     file = next((scene / name for name in POSES if (scene / name).is_file()), scene / POSES[-1])
     poses, images = _read_numbers(file, 16), images_in(scene / "images")

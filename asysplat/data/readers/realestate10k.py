@@ -42,11 +42,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
-    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded.
-
-    Raises:
-        InputError: a name outside of a chunk, or no such scene in it.
-    """
+    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded."""
     chunk = next((parent for parent in scene.parents if parent.suffix == CHUNK), None)
     if chunk is None:
         raise InputError(f"{scene} is no scene in a chunk: name one as 000000{CHUNK}/key.")

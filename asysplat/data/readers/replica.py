@@ -38,9 +38,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     `cam_params.json` lies above it, or in it if there is one room alone. Every row of `traj.txt`
     must have its image, and, if there is any depth map, its depth map.
-
-    Raises:
-        InputError: files that are missing or cannot be used.
     """
     files = (scene / PARAMETERS, scene.parent / PARAMETERS)
     parameters = next((file for file in files if file.is_file()), None)

@@ -77,9 +77,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     Args:
         scene: a file of poses, or a folder that stands for one.
-
-    Raises:
-        InputError: files that are missing or cannot be used.
     """
     files = find_scenes(scene)
     if len(files) != 1:

@@ -17,11 +17,7 @@ from asysplat.errors import InputError
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Find the file of poses of each scene's folder, or the named one.
-
-    Raises:
-        InputError: a scene has no depth maps.
-    """
+    """Find the file of poses of each scene's folder, or the named one."""
     scenes = [root] if root.is_file() else common.folders_with(root, *scannetpp.PARTS)
     return [file for scene in scenes for file in _with_depths(scene)]
 

@@ -129,11 +129,7 @@ def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
 
 
 def read_cameras(file: Path) -> Cameras:
-    """Read the cameras of a `transforms.json`, whose images may be absent, without distortion.
-
-    Raises:
-        InputError: a damaged file, one without frames, or images of different proportions.
-    """
+    """Read the cameras of a `transforms.json`, whose images may be absent, without distortion."""
     content, poses = common.read_frames(file), [pose for _, pose in read_poses(file)]
     if not poses:
         raise InputError(f"{file} has no frames: give at least one.")

@@ -17,11 +17,7 @@ SELECTIONS = ("every_8th", "kmeans", "first_96", "uniform")
 def named_selection(
     selection: str, cameras: Cameras, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
-    """Select images of a scene with these cameras by one of the methods in SELECTIONS.
-
-    Raises:
-        InputError: an unknown method, or too few images.
-    """
+    """Select images of a scene with these cameras by one of the methods in SELECTIONS."""
     if selection not in SELECTIONS:
         raise InputError(
             f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."

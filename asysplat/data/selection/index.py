@@ -35,9 +35,6 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
     left out, and a target may be an input. Long-LRM's: a list of {"scene_name": ...,
     "fold_8_kmeans_32_input": [...]}, where every 8th image is a target; or a scene's own
     opencv_cameras.json with such a list; or the folder of many scenes.
-
-    Raises:
-        InputError: neither form, or a list for another number of inputs.
     """
     path = Path(path)
     if path.is_dir():
@@ -71,12 +68,7 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
 def select_from_index(
     index: Mapping[str, Entry], path: Path | str, scene: str, num_images: int, num_inputs: int
 ) -> Selection:
-    """Look up the selection of a scene in the index that was read from `path`.
-
-    Raises:
-        InputError: the index was made for another number of inputs, or names an image that the
-            scene lacks.
-    """
+    """Look up the selection of a scene in the index that was read from `path`."""
     entry, where = index[scene], f"{path}, scene {scene}"
     if len(entry.inputs) != num_inputs:
         raise InputError(
@@ -97,11 +89,7 @@ def select_from_index(
 
 
 def write_index(path: Path, index: Mapping[str, Selection]) -> None:
-    """Write an index in pixelSplat's form.
-
-    Raises:
-        InputError: the file exists.
-    """
+    """Write an index in pixelSplat's form."""
     if path.exists():
         raise InputError(f"{path} exists: name a new file, nothing is overwritten.")
     scenes = {name: {"context": s.inputs, "target": s.targets} for name, s in index.items()}

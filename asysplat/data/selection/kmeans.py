@@ -21,9 +21,6 @@ def kmeans_selection(
 
     Every 8th image is a target; of the others, those nearest to the centers are inputs.
     Deterministic, on every machine.
-
-    Raises:
-        InputError: the sequence is too short.
     """
     images, targets = paper_split(cameras.num_views, num_targets, split)
     check_held_out(cameras.num_views, len(images), num_inputs, split)

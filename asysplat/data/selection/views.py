@@ -58,9 +58,6 @@ def training_selection(
         window: least and greatest number of images to draw from, clipped to the sequence; None: all
             of its images.
         targets_may_be_inputs: whether targets are drawn from all images of the window.
-
-    Raises:
-        InputError: the sequence or the window is too short.
     """
     _check_length(num_images, num_inputs, num_targets)
     shortest, longest = (num_images, num_images) if window is None else window
@@ -144,11 +141,7 @@ def evenly_spaced(images: Sequence[int], count: int) -> list[int]:
 
 
 def check_held_out(num_images: int, num_candidates: int, num_inputs: int, split: Split) -> None:
-    """Check that there are targets, and enough candidates for the inputs.
-
-    Raises:
-        InputError: there are too few.
-    """
+    """Check that there are targets, and enough candidates for the inputs."""
     if num_candidates < num_inputs or not held_out(num_images, split):
         raise InputError(
             f"The sequence has {num_images} images, of which {num_candidates} are not held out for "

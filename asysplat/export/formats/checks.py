@@ -19,11 +19,7 @@ def require_file(path: str | Path) -> Path:
 
 
 def prepare_for_export(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """Convert one scene to `dtype`, on the CPU and without gradients.
-
-    Raises:
-        InputError: a batch dimension, no Gaussians, or see `Gaussians.validate`.
-    """
+    """Convert one scene to `dtype`, on the CPU and without gradients."""
     if gaussians.opacities.ndim != 1:
         raise InputError(
             f"Gaussians.opacities has shape {tuple(gaussians.opacities.shape)}: expected [N]; "

@@ -46,9 +46,6 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
         path: the file.
         gaussians: [N].
         antialiased: as for `render`: a comment tells it.
-
-    Raises:
-        InputError: invalid Gaussians, or a file that cannot be written.
     """
     scene = in_morton_order(prepare_for_export(gaussians))
     count, chunks = scene.num_gaussians, -(-scene.num_gaussians // CHUNK)
@@ -95,11 +92,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
 
 
 def unpack(path: Path, elements: dict[str, ndarray]) -> Gaussians:
-    """Compute the Gaussians of a compressed PLY file from its elements chunk, vertex and sh.
-
-    Raises:
-        InputError: a missing element or property, too few rows, or invalid Gaussians.
-    """
+    """Compute the Gaussians of a compressed PLY file from its elements chunk, vertex and sh."""
     vertices, chunks = elements["vertex"], elements.get("chunk")
     if chunks is None or len(chunks) * CHUNK < len(vertices):
         raise InputError(

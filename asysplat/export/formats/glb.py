@@ -48,9 +48,6 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
 
     Quaternions are normalized; all else keeps its bits. Programs that lack the extension show
     colored points.
-
-    Raises:
-        InputError: invalid Gaussians, too many, or a file that cannot be written.
     """
     scene = half_turn(prepare_for_export(gaussians), 2)
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=-1).float().roll(-1, 1)
@@ -112,10 +109,6 @@ def read_glb(path: str | Path) -> Gaussians:
 
     The file may hold other meshes. Nodes may move, turn and scale the Gaussians, by the same factor
     along all axes.
-
-    Raises:
-        InputError: not a binary glTF file, a damaged one, one without Gaussians or with several
-            sets of them, compressed or sparse ones, or invalid Gaussians.
     """
     path = require_file(path)
     root, buffer = _read_chunks(path)

@@ -28,11 +28,7 @@ class JsonRecord(NamedTuple):
     def value(
         self, key: str, valid: Callable[[Any], bool], expected: str, default: Any = None
     ) -> Any:
-        """Return the value of a key, or the default where it is absent.
-
-        Raises:
-            InputError: the value is not valid; the message says what was expected.
-        """
+        """Return the value of a key, or the default where it is absent."""
         found = self.values.get(key, default)
         if not valid(found):
             text = "no" if found is None else f"the value {reprlib.repr(found)[:MAX_TEXT]} as"
@@ -103,11 +99,7 @@ class JsonRecord(NamedTuple):
 
 
 def parse_record(path: Path, name: str, content: bytes) -> JsonRecord:
-    """Read the JSON object that a part of a file holds.
-
-    Raises:
-        InputError: no JSON, or no object.
-    """
+    """Read the JSON object that a part of a file holds."""
     try:
         values = json.loads(content)
     # Also numbers of too many digits and nesting that is too deep.

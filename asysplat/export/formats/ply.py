@@ -45,9 +45,6 @@ def write_ply(
             `comment offset X Y Z`, if it is not 0.
         background: RGB in [0, 1] behind the Gaussians, if known: written as a comment likewise.
         antialiased: as for `render`.
-
-    Raises:
-        InputError: invalid Gaussians, or a file that cannot be written.
     """
     gaussians = prepare_for_export(gaussians)
     opacities = gaussians.opacities.double().clamp_max(MAX_OPACITY)
@@ -83,9 +80,6 @@ def read_ply(path: str | Path) -> Gaussians:
     """Read one scene from PLY, little-endian, big-endian, ASCII or compressed, in float32.
 
     Properties may have any order; unknown ones are ignored.
-
-    Raises:
-        InputError: not a PLY file, a truncated one, a missing property, or invalid Gaussians.
     """
     path = require_file(path)
     elements = read_elements(path, compressed_ply.ELEMENTS)

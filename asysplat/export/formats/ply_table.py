@@ -28,10 +28,6 @@ def read_elements(path: Path, names: Collection[str]) -> dict[str, ndarray]:
     """Read the elements with these names, among them the vertices: rows [N] of fields.
 
     An element that the file does not have is left out.
-
-    Raises:
-        InputError: not a PLY file, a truncated one, or one without vertices or with lists before or
-            in what is read.
     """
     with open(path, "rb") as file:
         byte_order, elements = _read_header(file, path)

@@ -23,11 +23,7 @@ def write_safetensors(
     metadata: dict[str, str] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> None:
-    """Write one scene's means, quats, scales, opacities and sh, and metadata.
-
-    Raises:
-        InputError: invalid Gaussians, or a file that cannot be written.
-    """
+    """Write one scene's means, quats, scales, opacities and sh, and metadata."""
     gaussians = prepare_for_export(gaussians, dtype)
     content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
     with atomic_write(path) as partial:
@@ -37,11 +33,7 @@ def write_safetensors(
 def read_safetensors(
     path: str | Path, dtype: torch.dtype = torch.float32
 ) -> tuple[Gaussians, dict[str, str]]:
-    """Read a scene and its metadata, as written by `write_safetensors`.
-
-    Raises:
-        InputError: no such file, a missing field, or invalid Gaussians.
-    """
+    """Read a scene and its metadata, as written by `write_safetensors`."""
     path = require_file(path)
     with _open(path) as file:
         tensors = {name: file.get_tensor(name).to(dtype) for name in file.keys()}  # noqa: SIM118
@@ -64,11 +56,7 @@ def read_safetensors(
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
-    """Read the metadata of a file alone, without its tensors.
-
-    Raises:
-        InputError: no such file, or a damaged one.
-    """
+    """Read the metadata of a file alone, without its tensors."""
     with _open(require_file(path)) as file:
         return file.metadata() or {}
 

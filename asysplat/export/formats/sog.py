@@ -59,9 +59,6 @@ def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
         path: the file.
         gaussians: [N].
         antialiased: as for `render`: meta.json tells it.
-
-    Raises:
-        InputError: invalid Gaussians, too many, or a file that cannot be written.
     """
     content = encode_sog(gaussians, antialiased)
     with atomic_write(path) as partial:
@@ -224,11 +221,7 @@ def _k_means(
 
 
 def read_sog(path: str | Path) -> Gaussians:
-    """Read one scene from a SOG bundle of version 2.
-
-    Raises:
-        InputError: not a SOG bundle, a damaged one, another version, or invalid Gaussians.
-    """
+    """Read one scene from a SOG bundle of version 2."""
     path = require_file(path)
     with _open(path) as archive:
         meta = _read_meta(archive, path)
@@ -258,11 +251,7 @@ def read_sog(path: str | Path) -> Gaussians:
 
 
 def is_antialiased(path: Path) -> bool:
-    """Read whether a file is to be rendered with `antialiased`.
-
-    Raises:
-        InputError: see `read_sog`.
-    """
+    """Read whether a file is to be rendered with `antialiased`."""
     with _open(path) as archive:
         return _read_meta(archive, path).values.get("antialias") is True
 
@@ -284,7 +273,6 @@ def _read_meta(archive: zipfile.ZipFile, path: Path) -> JsonRecord:
 
 
 def _decode(record: JsonRecord, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Look up numbers in a record's codebook."""
     return torch.tensor(record.numbers("codebook", CODES))[codes.int()]
 
 

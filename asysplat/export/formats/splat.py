@@ -19,9 +19,6 @@ def read_splat(path: str | Path) -> Gaussians:
 
     Scales are stored as they are, alpha is the opacity, rotations are (v - 128) / 128, wxyz.
     Format: https://github.com/antimatter15/splat
-
-    Raises:
-        InputError: no file, a size that is no multiple of a row, or invalid Gaussians.
     """
     path = require_file(path)
     size = path.stat().st_size
@@ -48,9 +45,6 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     """Write one scene, without batch dimension, as a .splat file, which holds no SH above degree 0.
 
     The most visible Gaussians come first, as viewers show a file while it loads.
-
-    Raises:
-        InputError: invalid Gaussians, or a file that cannot be written.
     """
     scene = prepare_for_export(gaussians)
     order = (scene.opacities.log() + scene.scales.log().sum(1)).argsort(descending=True)

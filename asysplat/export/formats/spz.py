@@ -71,10 +71,6 @@ def write_spz(
         gaussians: [N].
         version: 2 or 3, gzip, which most programs read; 4, Zstandard, needs the package zstandard.
         antialiased: as for `render`: a flag tells it.
-
-    Raises:
-        InputError: invalid Gaussians, another version, a file that cannot be written, or
-            zstandard is missing.
     """
     content = encode_spz(gaussians, version, antialiased)
     with atomic_write(path) as partial:
@@ -82,11 +78,7 @@ def write_spz(
 
 
 def encode_spz(gaussians: Gaussians, version: int = 3, antialiased: bool = False) -> bytes:
-    """Return the content of an SPZ file; see `write_spz`.
-
-    Raises:
-        InputError: as `write_spz` raises it.
-    """
+    """Return the content of an SPZ file; see `write_spz`."""
     if version not in (2, 3, 4):
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
     scene = in_morton_order(half_turn(prepare_for_export(gaussians), 0))
@@ -157,12 +149,7 @@ def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UIn
 
 
 def read_spz(path: str | Path) -> Gaussians:
-    """Read one scene from SPZ, version 2, 3 or 4; SH of degree 4 are left out.
-
-    Raises:
-        InputError: not an SPZ file, a damaged one, another version, invalid Gaussians, or
-            zstandard is missing.
-    """
+    """Read one scene from SPZ, version 2, 3 or 4; SH of degree 4 are left out."""
     path = require_file(path)
     content = path.read_bytes()
     header, streams = (_read_4 if content[:4] == MAGIC else _read_gzip)(path, content)
@@ -189,11 +176,7 @@ def read_spz(path: str | Path) -> Gaussians:
 
 
 def is_antialiased(path: Path) -> bool:
-    """Read whether a file is to be rendered with `antialiased`.
-
-    Raises:
-        InputError: see `read_spz`.
-    """
+    """Read whether a file is to be rendered with `antialiased`."""
     with open(path, "rb") as file:
         version_4 = file.read(4) == MAGIC
         file.seek(0)

@@ -59,7 +59,6 @@ class CacheBySources(UserProvidedCacheLocator):
 
 @cache
 def _cache_folder(parent: str) -> str:
-    """Return the cache folder for this version of all sources, with or without bounds checks."""
     # Numba compares only the kernel's own file, not the files of the functions that it inlines.
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
     name = f"kernels-{hash_sources()}{checks}"

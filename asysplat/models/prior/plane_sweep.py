@@ -108,9 +108,6 @@ def plane_sweep(
         ranges: least and greatest inverse depth of each view; where both are 0, and in all views
             if None, they follow from the cameras.
         masks: False in pixels that have no confidence; None: in none.
-
-    Raises:
-        InputError: sizes that do not fit together, an unknown backend, or a device without float64.
     """
     _check(images, cameras, planes, neighbors)
     backend = choose_backend(backend, images)

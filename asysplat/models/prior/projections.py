@@ -33,11 +33,7 @@ class PairwiseProjections:
 
     @classmethod
     def from_cameras(cls, cameras: Cameras) -> "PairwiseProjections":
-        """Compute the projections in float64.
-
-        Raises:
-            InputError: cameras on a device without float64.
-        """
+        """Compute the projections in float64."""
         poses = to_float64(cameras.cam_to_world)
         size = poses.new_tensor([1 / cameras.width, 1 / cameras.height, 1])
         intrinsics = size[:, None] * to_float64(cameras.intrinsics)

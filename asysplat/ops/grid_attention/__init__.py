@@ -30,10 +30,6 @@ def grid_attention(
         q, k, v: queries, keys and values of the h x w tokens of V views; P is the head_dim.
         grid: p_g, the side of the grid in tokens; 1 is full attention.
         backend: "sdpa" (torch's fused attention), "reference", or "auto", which is "sdpa".
-
-    Raises:
-        InputError: shapes, devices or types that do not fit together, grid < 1, or an unknown
-            backend.
     """
     implementation = look_up_backend("grid_attention", _BACKENDS, backend)
     _check(q, k, v, grid)

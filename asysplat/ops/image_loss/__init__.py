@@ -41,10 +41,6 @@ def image_loss(
 
     Returns:
         The loss of each image in fp32, or in float64 if `rendered` is float64.
-
-    Raises:
-        InputError: shapes, types or devices that do not fit together, a weight outside [0, 1], an
-            unknown backend or one that cannot take these tensors.
     """
     _check(rendered, target, ssim_weight, masks)
     on_cpu = rendered.device.type == "cpu" and rendered.dtype != torch.float64

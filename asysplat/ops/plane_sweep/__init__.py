@@ -25,11 +25,7 @@ __all__ = ["BestPlane", "Consistency", "choose_backend", "load_backend"]
 
 
 def choose_backend(backend: str, x: Tensor) -> str:
-    """Return the backend's name; for "auto", that of x's device, or "reference" for float64.
-
-    Raises:
-        InputError: an unknown name, or a backend that cannot take x.
-    """
+    """Return the backend's name; for "auto", that of x's device, or "reference" for float64."""
     look_up_backend("plane_sweep", dict.fromkeys(("auto", "reference", *KERNEL_BACKENDS)), backend)
     if backend == "auto":
         return choose_fastest(x, "reference", "asysplat.ops.self_check:plane_sweep")

@@ -48,9 +48,5 @@ def selective_scan(
             "auto": the kernels of the device, but "chunked" for float64 and for sizes that "cuda"
             cannot take.
         reverse: scan from the last token to the first.
-
-    Raises:
-        InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
-            that do not fit together; integers; no token.
     """
     return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)

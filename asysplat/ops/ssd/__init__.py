@@ -45,8 +45,5 @@ def ssd(
     Args:
         x: inputs of H heads; P is the head_dim. For half precision, see `selective_scan`.
         dt, A, B, C, D, backend, reverse: see `selective_scan`, with heads in place of channels.
-
-    Raises:
-        InputError: see `selective_scan`.
     """
     return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)

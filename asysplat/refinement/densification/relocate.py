@@ -93,9 +93,6 @@ def split_opacity_and_scale(
 
     The paper's double sum of binomials is sum_k C(n, k) (-1)^(k+1) o^k / sqrt(k), k = 1 to n. More
     copies than MAX_COPIES count as that many; `counts` are >= 1.
-
-    Raises:
-        InputError: tensors on a device without float64.
     """
     counts, before = counts.clamp(max=MAX_COPIES), to_float64(opacities).clamp(max=1 - 1e-6)
     reduced = 1 - (1 - before) ** (1 / counts)

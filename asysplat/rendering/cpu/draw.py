@@ -63,11 +63,6 @@ def draw(
 
     The values of pixels where `masks` is False are arbitrary. `centers` receives the gradients of
     the centers.
-
-    Raises:
-        MemoryError: too many splats at once.
-        InputError: tensors that are not on a CPU; more pairs of splat and tile than a list can
-            number.
     """
     if gaussians.means.device.type != "cpu":
         raise InputError(
@@ -166,7 +161,6 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
 def _inputs(
     tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
 ) -> KernelInputs:
-    """Convert the fields of Gaussians, poses and intrinsics to arrays."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return KernelInputs(*(_array(field) for field in fields), cameras=cameras.numpy())
@@ -284,7 +278,6 @@ def _project_backward(
 def _center_gradients(
     frame: Frame, first_pair: np.ndarray, pair_grads: np.ndarray
 ) -> Float[Tensor, "B V N 2"]:
-    """Sum the gradients of each splat's center over its tiles."""
     counts = torch.from_numpy(first_pair).diff()
     owners = torch.arange(len(counts)).repeat_interleave(counts)
     sums = torch.zeros(len(counts), 2, dtype=torch.float64)
@@ -308,7 +301,6 @@ def _depths(
 
 
 def _empty_like(tensor: Tensor) -> Tensor:
-    """Allocate with NumPy, which is several times faster than torch for large arrays."""
     return torch.from_numpy(np.empty_like(tensor.detach().numpy(), order="C"))
 
 

@@ -50,10 +50,6 @@ def draw(
 
     The values of pixels where `masks` is False are arbitrary. Uses all of `settings.culling` but
     rows.
-
-    Raises:
-        InputError: tensors that are not on a GPU, unless Triton interprets its kernels
-            (TRITON_INTERPRET=1); more splats, or pairs of splat and tile, than a list can number.
     """
     if not (gaussians.means.is_cuda or INTERPRETED):
         raise InputError(
@@ -152,14 +148,12 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
 def _inputs(
     tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
 ) -> KernelInputs:
-    """Arrange the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return KernelInputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
 def _kinds(settings: RenderSettings) -> dict[str, bool]:
-    """Return the constants of the kernels that select the kind of depth."""
     depth = settings.depth
     return {"DEPTH": depth not in (None, "median"), "MEDIAN": depth == "median"}
 

@@ -16,9 +16,6 @@ class BadScenes(Callback):
 
     Args:
         budget: how many different errors a process accepts.
-
-    Raises:
-        InputError: there are more.
     """
 
     def __init__(self, budget: int = 10):

@@ -167,11 +167,7 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically, reads those of earlier versions under today's names.
-
-    Raises:
-        InputError: the disk is full or the folder is not writable.
-    """
+    """Writes checkpoints atomically, reads those of earlier versions under today's names."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None

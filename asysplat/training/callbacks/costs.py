@@ -95,9 +95,6 @@ def make_plan(trainer: Trainer, module: SplattingModule) -> str:
     """Try a micro-batch and describe the training: parameters, steps, memory in 1e9 bytes, time.
 
     The network is left as it was. The memory is without the optimizer's moments.
-
-    Raises:
-        InputError: a micro-batch does not fit into memory.
     """
     capacity = memory_gb(module.device)
     capacity /= 1 if module.device.type == "cuda" else trainer.num_devices

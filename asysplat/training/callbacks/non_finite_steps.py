@@ -24,9 +24,6 @@ class NonFiniteSteps(Callback):
 
     Args:
         budget: the run ends after this many non-finite steps in a row.
-
-    Raises:
-        InputError: the budget is used up; the message names a tensor.
     """
 
     def __init__(self, budget: int = 10):

@@ -106,11 +106,7 @@ def pixels_apart(gaussians: Gaussians, inputs: Views) -> int:
 
 
 def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h w"]:
-    """Compute each Gaussian's depth in the input view it is aligned with.
-
-    Raises:
-        InputError: there are not V h w Gaussians, with height / h = width / w a whole number.
-    """
+    """Compute each Gaussian's depth in the input view it is aligned with."""
     cameras, count = inputs.cameras, gaussians.num_gaussians
     stride = pixels_apart(gaussians, inputs)
     height, width = cameras.height // stride, cameras.width // stride

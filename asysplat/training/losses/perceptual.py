@@ -55,9 +55,6 @@ def vgg16(backbone_dir: str | None = None, download: bool = False) -> Perceptual
     Args:
         backbone_dir: folder that may hold the network's weights.
         download: whether to download missing weights.
-
-    Raises:
-        FileNotFoundError: the weights are not on this machine; it says how to fetch them.
     """
     backbone = _backbone("vgg16", backbone_dir, download)
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
@@ -83,9 +80,6 @@ def longlrm(
         backbone_dir, download: as for `vgg16`.
         weights: those of MatConvNet, which Long-LRM names and publishes in these units, or
             torchvision's.
-
-    Raises:
-        FileNotFoundError: as `vgg16`.
     """
     name = "matconvnet_vgg19" if weights == "matconvnet" else "vgg19"
     backbone = _backbone(name, backbone_dir, download)

@@ -25,11 +25,6 @@ class SplattingLoss(nn.Module):
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
         allow_missing: turn off, with a warning, the depth term if the data has no depths or
             disparities for it.
-
-    Raises:
-        InputError: all terms are off, or, at the first batch, the depth term is missing and that is
-            not allowed.
-        FileNotFoundError: the perceptual term's network is not on this machine.
     """
 
     def __init__(
@@ -100,11 +95,7 @@ class SplattingLoss(nn.Module):
 
 
 def report_missing(reason: str, allowed: bool) -> None:
-    """Warn that the training continues without a term of the loss.
-
-    Raises:
-        InputError: the term may not be missing.
-    """
+    """Warn that the training continues without a term of the loss."""
     if not allowed:
         raise InputError(f"{reason}, and allow_missing_losses=true trains without this term.")
     warnings.warn(f"{reason}. Training continues without this term.", stacklevel=4)

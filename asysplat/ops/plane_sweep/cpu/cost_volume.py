@@ -210,7 +210,6 @@ def _compare_rows(first, second, patches, y, warped, visible, spans):
 
 @inline
 def _add(sums, value, pixel):
-    """Add a neighbor's values to the sums of values, squares and products."""
     return sums[0] + value, fma(value, value, sums[1]), fma(value, pixel, sums[2])
 
 
@@ -235,7 +234,6 @@ def _cost(sums, offset, scale):
 
 @inline
 def _merge(first, second, x, cost):
-    """Merge a cost into the two least of a pixel."""
     before = load(first, x)
     store(second, x, min(load(second, x), max(before, cost)))
     store(first, x, min(before, cost))

@@ -90,7 +90,6 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
 
 @inline
 def _begin(weighted, sums, costs, weight):
-    """Write the weighted costs of a pixel, infinite beyond its planes, and clear its sums."""
     for d in range(0, len(weighted), LANES):
         count = min(len(costs) - d, LANES)
         store_some(weighted, d, LANES, INFINITY + zeros())

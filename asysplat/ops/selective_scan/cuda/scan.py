@@ -149,7 +149,6 @@ def _compute_states(
 
 
 def _segments(x: Float[Tensor, "B L D"], A: Float[Tensor, "D N"]) -> list[range]:
-    """Return the positions of each segment, whole chunks except for the last."""
     (batch, length, _), chunk = x.shape, max(FORWARD_CHUNK, BACKWARD_CHUNK)
     size = max(SEGMENT // (batch * A.numel()), SHORTEST) // chunk * chunk
     return [range(start, min(start + size, length)) for start in range(0, length, size)]

@@ -92,7 +92,6 @@ def backward(
 
 
 def _iterate_segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]:
-    """Yield each segment's index and tokens, in scan order."""
     indices = range(-(-length // SEGMENT))
     for index in reversed(indices) if reverse else indices:
         yield index, slice(index * SEGMENT, min((index + 1) * SEGMENT, length))
@@ -130,7 +129,6 @@ def _pad_to_chunks(tokens: Tensor) -> Tensor:
 
 
 def _round_up_to_vectors(count: int | torch.SymInt) -> int | torch.SymInt:
-    """Round a number of columns up to whole vectors."""
     return -(-count // LANES) * LANES
 
 
