@@ -19,14 +19,14 @@ from rich.progress import track
 
 from asysplat.files import atomic_write, make_folder
 from asysplat.overrides import check_overrides
-from asysplat.report.fill import fill_table, finished_runs, with_costs
-from asysplat.report.html import render_html
-from asysplat.report.markdown import render_markdown
-from asysplat.report.paper import find_tables
-from asysplat.report.runs import report_runs
-from asysplat.report.terminal import render_terminal
-from asysplat.runs.systems import find_systems
 from asysplat.terminal import make_console
+from paper.fill import fill_table, finished_runs, with_costs
+from paper.html import render_html
+from paper.markdown import render_markdown
+from paper.runs import report_runs
+from paper.systems import find_systems
+from paper.tables import find_tables
+from paper.terminal import render_terminal
 
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "runs", "output")
 

@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import check_writable
 from asysplat.runs.revision import revision
-from asysplat.runs.run_folder import job_name, run_folder, unused_removed
 from asysplat.runs.runs import find_run
 from asysplat.training.prepare import (
     PreparedRun,
@@ -30,6 +29,7 @@ from asysplat.training.prepare import (
     prepare_run,
     without_missing_network,
 )
+from asysplat.training.run_folder import job_name, run_folder, unused_removed
 
 
 @command("train")  # during the training, Checkpoints prints how to resume

@@ -41,8 +41,6 @@ from asysplat.models.network import Network
 from asysplat.refinement import merge_to_limit, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.rendering import INRIA, render
-from asysplat.report.front import draw_front
-from asysplat.report.style import FAINT, OURS, STYLE
 from asysplat.runs.device import find_device
 from asysplat.scene import Views
 from benchmarks import timing
@@ -57,6 +55,8 @@ from benchmarks.table import (
     text_column,
 )
 from benchmarks.timing import Measurement, Result, summarize
+from paper.front import draw_front
+from paper.style import FAINT, OURS, STYLE
 
 # Values of a setting that must be whole numbers
 WHOLE_NUMBERS = {"views", "side", "max_gaussians", "views_at_once", "steps"}

@@ -6,9 +6,9 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from asysplat.report.style import FAINT, INK, OURS, STYLE
 from benchmarks.table import largest_at
 from benchmarks.timing import Result
+from paper.style import FAINT, INK, OURS, STYLE
 
 COLORS = {"cpu": OURS, "cuda": INK, "reference": FAINT}
 MARKS = "osD^vPX*"

@@ -38,12 +38,12 @@ from asysplat.refinement import (
 )
 from asysplat.refinement.init import initial_gaussians
 from asysplat.rendering import render
-from asysplat.report.style import FAINT, OURS, PAPER, STYLE
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
 from benchmarks.options import check_names
 from benchmarks.pareto import NOISE_OF_SECONDS, FeedForward, find_scenes
 from benchmarks.table import Columns, machine_note, make_table, number_column, text_column
 from benchmarks.timing import Result
+from paper.style import FAINT, OURS, PAPER, STYLE
 
 PUBLISHED_STEPS = 30_000  # of 3DGS and Scaffold-GS
 SPEEDS = ("fast", "balanced", "exact")  # of the network, see conf/speed

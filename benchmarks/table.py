@@ -13,8 +13,8 @@ from rich.box import ROUNDED
 from rich.table import Table
 
 from asysplat.files import atomic_write
-from asysplat.report.markdown import escape
 from benchmarks.timing import BUSY, Result
+from paper.markdown import escape
 
 NOT_MEASURED = "-"
 WIDTH = 100  # a dictionary or list that is longer as one line of JSON is split

@@ -33,7 +33,7 @@ def test_named_files_exist(repository, document):
 
 def test_named_functions_and_options_exist(repository):
     """Words in code font with an underscore or a capital within, anywhere but in a path."""
-    folders = ("asysplat", "benchmarks", "conf", "docs", "examples", "tests")
+    folders = ("asysplat", "benchmarks", "conf", "docs", "examples", "paper", "tests")
     files = [f for name in folders for f in (repository / name).rglob("*") if f.suffix in SOURCES]
     files += [repository / "pyproject.toml", *repository.glob("*.py")]
     known = {word for file in files for word in re.findall(r"\w+", file.read_text() + file.stem)}

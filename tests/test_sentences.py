@@ -20,8 +20,8 @@ from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 from asysplat.refinement.adam import SelectiveAdam
 from asysplat.runs.checkpoints import load_weights
-from asysplat.runs.run_folder import locked
 from asysplat.runs.runs import find_runs
+from asysplat.training.run_folder import locked
 
 SIZE = SceneOptions(24, 32)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from asysplat.runs.runs import Run
-from asysplat.runs.sweep_table import sweep_table
 from asysplat.terminal import make_console, print_table
+from asysplat.training.sweep_table import sweep_table
 
 HOSTILE = "[/b] [red]x :smile: test_sets=[replica]"
 

@@ -1,25 +1,20 @@
-"""Evaluations of other systems' scenes: what they were measured on, and where they are on disk."""
+"""What another system's scenes are measured on, and made of."""
 
 import glob
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
 from asysplat.runs.run_config import plain_options
-from asysplat.runs.runs import EVALUATION, Run, content_of, files_below, hash_of, name_of
-from asysplat.runs.summary import TESTED, read_results
+from asysplat.runs.runs import content_of, hash_of, name_of
+from asysplat.runs.summary import TESTED
 
 SYSTEM = "evaluation/system"
 # Options of the data that choose the images of a test, and their size.
 IMAGES = ("inputs", "targets", "height", "width", "selection")
 IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
-# What a report says of an evaluation.
-SHOWN = {
-    f"{TESTED}{key}" for key in ("scenes", "data", "inputs", "height", "width", "metrics.name")
-}
 
 
 def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any]) -> dict[str, Any]:
@@ -66,22 +61,3 @@ def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
     metrics = plain_options(config.metrics)
     options |= {f"metrics.{key}": value for key, value in metrics.items() if key != "_target_"}
     return {key: value for key, value in options.items() if value not in (None, MISSING)}
-
-
-def find_systems(logs: Path) -> Iterator[Run]:
-    """Yield every finished evaluation of another system below `logs`, oldest first."""
-    for path in files_below(logs, EVALUATION):
-        try:
-            results = read_results(path)
-            if SYSTEM not in results:
-                continue
-            described = (
-                results[f"evaluation/{key}"] for key in ("config_hash", "seed", "revision")
-            )
-            run = Run(path.parent, *described, results)
-            if missing := SHOWN - results.keys():
-                raise KeyError(*missing)
-        except (ValueError, KeyError, TypeError):
-            warnings.warn(f"{path} is not a finished evaluation: it is left out.", stacklevel=2)
-            continue
-        yield run

@@ -34,7 +34,6 @@ from asysplat.runs.checkpoints import (
 from asysplat.runs.device import find_accelerator
 from asysplat.runs.revision import revision
 from asysplat.runs.run_config import plain_options
-from asysplat.runs.run_folder import locked
 from asysplat.runs.runs import RESULTS, describe_run
 from asysplat.runs.stages import (
     check_stages,
@@ -48,6 +47,7 @@ from asysplat.training.callbacks.stage_record import StageRecord
 from asysplat.training.losses.splatting import report_missing
 from asysplat.training.messages import quiet_lightning
 from asysplat.training.module import SplattingModule
+from asysplat.training.run_folder import locked
 from asysplat.training.tensorboard import cut_events, log_choices, log_results
 
 Callbacks = Mapping[str, lightning.Callback]

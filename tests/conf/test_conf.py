@@ -15,7 +15,7 @@ from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.refinement import PAPER, PUBLISHED_3DGS, RefinementSettings, ScaffoldSettings
-from asysplat.report.paper import find_tables
+from paper.tables import find_tables
 
 ROOT = Path(__file__).parents[2]
 CONF, SWEEPS = ROOT / "conf", ROOT / "conf" / "sweeps"

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from asysplat.data.batches import split_batch
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
-from asysplat.report.paper import load_paper
+from paper.tables import load_paper
 
 ROOT = Path(__file__).parents[2]
 PLACES = ["data.root=train", "data.test_root=test"]

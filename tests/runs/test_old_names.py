@@ -16,10 +16,10 @@ from tiny_runs import finished
 
 from asysplat import load, render
 from asysplat.evaluation.metrics import psnr
-from asysplat.report.fill import finished_runs
 from asysplat.runs.old_names import CLASSES, KEYS
 from asysplat.runs.run_config import read_config
 from asysplat.runs.runs import config_hash, find_run
+from paper.fill import finished_runs
 
 OLD_RUN = Path(__file__).parent / "old_run"
 LATER = {"allow_missing_losses", "training.loss.allow_missing"}  # options without effect on it

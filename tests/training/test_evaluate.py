@@ -20,9 +20,9 @@ from asysplat.evaluation import scenes
 from asysplat.export import read_gaussians, write_gaussians
 from asysplat.geometry.motion import transform
 from asysplat.rendering import render
-from asysplat.report.fill import fill_table, finished_runs
-from asysplat.report.paper import load_paper
-from asysplat.runs.systems import find_systems
+from paper.fill import fill_table, finished_runs
+from paper.systems import find_systems
+from paper.tables import load_paper
 
 pytestmark = pytest.mark.medium
 

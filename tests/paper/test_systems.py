@@ -5,10 +5,11 @@ import re
 
 import pytest
 
-from asysplat.report.fill import fill_table
-from asysplat.report.markdown import render_markdown
-from asysplat.report.paper import load_paper
-from asysplat.runs.systems import find_systems, options_of_test
+from asysplat.runs.systems import options_of_test
+from paper.fill import fill_table
+from paper.markdown import render_markdown
+from paper.systems import find_systems
+from paper.tables import load_paper
 
 RE10K = ["data=realestate10k", "data.test_root=/a/re10k/test", "data.root=/a/re10k/train"]
 TWO_VIEWS = ["experiment=two_views", "metrics=pixelsplat", *RE10K]

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from asysplat.errors import InputError
-from asysplat.report.reconstructions import read_reconstructions
-from asysplat.report.runs import make_overview, report_runs
+from paper.reconstructions import read_reconstructions
+from paper.runs import make_overview, report_runs
 
 PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\x04\x4c\0\0\x02\x26"
 HOSTILE = "<img src=x onerror=alert(1)>\"'&amp;"

@@ -12,8 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.report.notes import data_text, rows_by_text
-from asysplat.report.paper import (
+from asysplat.runs.run_config import plain_options
+from asysplat.runs.runs import Run, config_hash, data_of, differences, find_runs
+from asysplat.runs.stages import describe_stage, stage_configs
+from asysplat.training.tensorboard import CHOICES
+from paper.notes import data_text, rows_by_text
+from paper.systems import system_rows
+from paper.tables import (
     Costs,
     Number,
     PaperRow,
@@ -23,11 +28,6 @@ from asysplat.report.paper import (
     set_titles,
     stage_hours,
 )
-from asysplat.report.systems import system_rows
-from asysplat.runs.run_config import plain_options
-from asysplat.runs.runs import Run, config_hash, data_of, differences, find_runs
-from asysplat.runs.stages import describe_stage, stage_configs
-from asysplat.training.tensorboard import CHOICES
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]

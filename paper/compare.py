@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import spearmanr
 from scipy.stats import t as student
 
-from asysplat.report.paper import Claim, Costs, Number, PaperRow, PaperTable
+from paper.tables import Claim, Costs, Number, PaperRow, PaperTable
 
 # A smaller `signal` may come from the seeds alone: one table in twenty of six equal rows and three
 # seeds exceeds it (the F distribution's 95 % is 3.1 = 1.76 ** 2).

@@ -8,13 +8,13 @@ import pytest
 from omegaconf import OmegaConf
 
 from asysplat.evaluation import static_cost
-from asysplat.report.compare import check_costs, fits
-from asysplat.report.fill import fill_table, finished_runs, with_costs
-from asysplat.report.markdown import render_markdown
-from asysplat.report.paper import find_tables, load_paper
 from asysplat.runs.revision import revision
 from asysplat.runs.runs import describe_run, find_run
 from asysplat.runs.stages import stage_configs
+from paper.compare import check_costs, fits
+from paper.fill import fill_table, finished_runs, with_costs
+from paper.markdown import render_markdown
+from paper.tables import find_tables, load_paper
 
 OVERRIDES = ["steps=7"]
 

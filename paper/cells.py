@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from asysplat.report.compare import (
+from paper.compare import (
     LIMITS,
     check_costs,
     claim_value,
@@ -11,10 +11,10 @@ from asysplat.report.compare import (
     mean_and_std,
     paired_difference,
 )
-from asysplat.report.fill import COMPUTED
-from asysplat.report.notes import notes, protocol_notes, rho_text
-from asysplat.report.paper import Claim, Column, Costs, Number, PaperRow, PaperTable
-from asysplat.report.table import Cell, Grid, Heading, Section, anchor
+from paper.fill import COMPUTED
+from paper.grid import Cell, Grid, Heading, Section, anchor
+from paper.notes import notes, protocol_notes, rho_text
+from paper.tables import Claim, Column, Costs, Number, PaperRow, PaperTable
 
 TITLE = "AsySplat: our numbers beside the paper's"
 INTRODUCTION = (

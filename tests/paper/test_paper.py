@@ -5,7 +5,7 @@ import re
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.report.paper import (
+from paper.tables import (
     PaperRow,
     PaperTable,
     find_tables,

@@ -6,12 +6,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from asysplat.report.cells import ARROWS
-from asysplat.report.compare import mean_and_std
-from asysplat.report.fill import COMPUTED
-from asysplat.report.front import draw_front
-from asysplat.report.paper import Column, PaperTable
-from asysplat.report.style import FAINT, OURS, PAPER, STYLE
+from paper.cells import ARROWS
+from paper.compare import mean_and_std
+from paper.fill import COMPUTED
+from paper.front import draw_front
+from paper.style import FAINT, OURS, PAPER, STYLE
+from paper.tables import Column, PaperTable
 
 # Tables in which one quantity varies: the meaning of the first number in a row's name.
 RATIOS = {

@@ -4,8 +4,8 @@ from itertools import combinations
 
 from matplotlib.figure import Figure
 
-from asysplat.report.front import draw_front
-from asysplat.report.style import FAINT
+from paper.front import draw_front
+from paper.style import FAINT
 
 POINTS = [("slow", 3.0, 30.0), ("quick", 1.0, 20.0), ("base", 2.0, 25.0), ("worse", 2.5, 22.0)]
 CROWD = [(f"crowded_{number}", 2.6 + 1e-3 * number, 21.0) for number in range(9)]

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asysplat.report.cells import make_section
-from asysplat.report.compare import (
+from paper.cells import make_section
+from paper.compare import (
     check_costs,
     claim_value,
     cost_errors,
@@ -15,8 +15,8 @@ from asysplat.report.compare import (
     rank_agreement,
     spearman,
 )
-from asysplat.report.paper import Claim, Column, PaperRow, PaperTable
-from asysplat.report.table import Cell
+from paper.grid import Cell
+from paper.tables import Claim, Column, PaperRow, PaperTable
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
 

@@ -6,13 +6,13 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from asysplat.report.fill import COMPUTED
-from asysplat.report.front import pareto_front
-from asysplat.report.html import render_html
-from asysplat.report.markdown import escape, render_markdown
-from asysplat.report.paper import Column, PaperRow, PaperTable
-from asysplat.report.plots import make_plots
-from asysplat.report.terminal import render_terminal
+from paper.fill import COMPUTED
+from paper.front import pareto_front
+from paper.html import render_html
+from paper.markdown import escape, render_markdown
+from paper.plots import make_plots
+from paper.tables import Column, PaperRow, PaperTable
+from paper.terminal import render_terminal
 
 COLUMNS = (
     Column("parameters", "Param (M)", None, "{:.1f}", 1e6),

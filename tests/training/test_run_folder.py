@@ -9,7 +9,7 @@ import time
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.runs.run_folder import job_name, locked, run_folder
+from asysplat.training.run_folder import job_name, locked, run_folder
 
 FORK = multiprocessing.get_context("fork")
 

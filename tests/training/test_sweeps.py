@@ -36,7 +36,7 @@ def at_exit(monkeypatch, capsys):
     """What the process of the last sweep prints at its end."""
     calls = []
     register = SimpleNamespace(register=lambda *call: calls.append(call))
-    monkeypatch.setattr("asysplat.runs.sweep_table.atexit", register)
+    monkeypatch.setattr("asysplat.training.sweep_table.atexit", register)
 
     def printed() -> str:
         capsys.readouterr()

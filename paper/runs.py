@@ -16,20 +16,20 @@ from asysplat.evaluation.metrics import METRICS
 from asysplat.export.gaussians import WRITERS
 from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, make_folder
-from asysplat.report.html import TEMPLATES
-from asysplat.report.reconstructions import (
+from asysplat.root import typed
+from asysplat.runs.runs import PICTURE
+from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells
+from asysplat.terminal import make_console
+from paper.grid import Cell, Grid, Heading
+from paper.html import TEMPLATES
+from paper.reconstructions import (
     COUNTS,
     SHOWN,
     Reconstruction,
     cut,
     read_reconstructions,
 )
-from asysplat.report.table import Cell, Grid, Heading
-from asysplat.report.terminal import print_grid
-from asysplat.root import typed
-from asysplat.runs.runs import PICTURE
-from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells
-from asysplat.terminal import make_console
+from paper.terminal import print_grid
 
 PNG = b"\x89PNG\r\n\x1a\n"
 GENERATOR = b'<meta name="generator" content="asysplat report">'  # as in base.html.jinja

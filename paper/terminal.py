@@ -6,10 +6,10 @@ from rich.box import ROUNDED
 from rich.console import Console
 from rich.text import Text
 
-from asysplat.report.cells import make_overview, make_section
-from asysplat.report.paper import PaperTable
-from asysplat.report.table import Grid, Note
 from asysplat.terminal import print_table
+from paper.cells import make_overview, make_section
+from paper.grid import Grid, Note
+from paper.tables import PaperTable
 
 STYLES = {"": "", "best": "bold green", "muted": "dim", "alarm": "bold red"}
 

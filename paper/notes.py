@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from asysplat.report.compare import CLEAR_SIGNAL, rank_agreement
-from asysplat.report.paper import PaperTable, set_titles
-from asysplat.report.table import Note
+from paper.compare import CLEAR_SIGNAL, rank_agreement
+from paper.grid import Note
+from paper.tables import PaperTable, set_titles
 
 SHOWN = 3  # options of a remark that are not folded away
 

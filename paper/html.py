@@ -10,10 +10,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_section
-from asysplat.report.paper import PaperTable
-from asysplat.report.plots import make_plots
-from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
+from paper.cells import INTRODUCTION, TITLE, make_overview, make_section
+from paper.plots import make_plots
+from paper.style import FAINT, INK, OURS, PAPER, STYLE
+from paper.tables import PaperTable
 
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),

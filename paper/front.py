@@ -4,7 +4,7 @@ from collections.abc import Collection, Sequence
 
 from matplotlib.axes import Axes
 
-from asysplat.report.style import FAINT, INK
+from paper.style import FAINT, INK
 
 Point = tuple[str, float, float]  # name, cost, quality
 # Where a name is beside its point: offset in typographic points, alignments.

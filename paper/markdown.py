@@ -3,9 +3,9 @@
 import re
 from collections.abc import Sequence
 
-from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_section
-from asysplat.report.paper import PaperTable
-from asysplat.report.table import Cell, Grid, Note
+from paper.cells import INTRODUCTION, TITLE, make_overview, make_section
+from paper.grid import Cell, Grid, Note
+from paper.tables import PaperTable
 
 
 def render_markdown(tables: Sequence[PaperTable]) -> str:
