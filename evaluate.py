@@ -5,7 +5,6 @@ python evaluate.py run=last
 
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,14 +39,12 @@ from asysplat.export import write_safetensors
 from asysplat.export.gaussians import read_notes
 from asysplat.export.scene_folder import check_visible, find_files, world_origin
 from asysplat.files import check_writable, make_folder
-from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
 from asysplat.refinement import AnchorScene, ScaffoldSettings, refine, refine_scaffold
 from asysplat.refinement.init import initial_gaussians
-from asysplat.runs.checkpoints import build_within, existing_weights, load_weights
+from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
-from asysplat.runs.run_config import using_config
 from asysplat.runs.runs import EVALUATION
 from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views
@@ -63,14 +60,13 @@ def evaluate(options: DictConfig) -> None:
     target = find_target(options, HydraConfig.get().overrides.task)
     config = target.config
     check_writable(target.scene_folder, "paths.logs")
-    with using_config(target.file) if target.file else nullcontext():
-        lightning.seed_everything(config.seed, workers=True, verbose=False)
-        fabric = make_fabric(config)
-        measure = make_measure(config, options, fabric.device)
-        net = load_network(config, fabric.device) if target.system is None else None
-        data = instantiate(config.data)
-        data.setup()
-        data.check_sizes(measure.protocol.check_size)
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    fabric = make_fabric(config)
+    measure = make_measure(config, options, fabric.device)
+    net = load_network(config, fabric.device) if target.system is None else None
+    data = instantiate(config.data)
+    data.setup()
+    data.check_sizes(measure.protocol.check_size)
     tests, early_exit, fingerprint = data.tests, {}, target.fingerprint
     if net is not None:
         data.check_sizes(net.check_size)
@@ -141,13 +137,10 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 
 def load_network(config: DictConfig, device: torch.device) -> Network:
     """Load a model, with its early exit."""
-    if config.init_path is None:
-        net = instantiate(config.model)
-    else:
-        net = build_within(config.model, existing_weights(config.init_path))
+    net = instantiate(config.model)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(device).eval()
-    net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
+    net.early_exit = instantiate(config.speed)
     print(f"model: {net.describe()}")
     return net
 

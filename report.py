@@ -23,7 +23,7 @@ from asysplat.terminal import make_console
 from paper.fill import fill_table, finished_runs, with_costs
 from paper.html import render_html
 from paper.markdown import render_markdown
-from paper.runs import report_runs
+from paper.reconstructions import report_reconstructions
 from paper.systems import find_systems
 from paper.tables import find_tables
 from paper.terminal import render_terminal
@@ -36,7 +36,7 @@ def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html; or the page of `runs`."""
     output = None if options.output is None else Path(str(options.output))
     if options.runs is not None:
-        return report_runs(Path(str(options.runs)), output)
+        return report_reconstructions(Path(str(options.runs)), output)
     tables, logs = find_tables(options.table), Path(options.logs)
     folder = output or logs / "report"
     make_folder(folder, "output")

@@ -7,20 +7,12 @@ MAX_NAMES = 5  # names in a message
 MAX_CHARACTERS = 500  # of another error's in a message
 
 
-def printable(text: str) -> str:
-    """Replace characters that a terminal obeys, or that UTF-8 does not have; lines stay."""
-    return "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in text)
-
-
 class InputError(ValueError):
     """Invalid input of a user.
 
     The message is one sentence: the field or file, what was found, what is expected, and how to fix
-    it. Scripts print it without a traceback. It is printable, as names may be a stranger's.
+    it. Scripts print it without a traceback.
     """
-
-    def __init__(self, message: str = ""):
-        super().__init__(printable(message))
 
 
 def list_names(names: Collection[str]) -> str:
@@ -54,4 +46,4 @@ def brief(error: BaseException) -> str:
 
 def plain_warnings() -> None:
     """Print warnings as one line, without their line of code."""
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {printable(str(message))}\n"
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"

@@ -1,4 +1,4 @@
-"""Reading that ends, and writing that loses nothing: bounded text, atomic writes, own folders."""
+"""Reading that ends, and writing that loses nothing: atomic writes, own folders."""
 
 import errno
 import json
@@ -13,16 +13,13 @@ from uuid import uuid4
 
 from asysplat.errors import InputError
 
-MAX_TEXT = 2**28  # bytes of a text file; the poses of 100,000 photographs take a tenth
-
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder to write to, then move it to `path`.
 
     The file is synced to disk before. Any exception, KeyboardInterrupt too, leaves `path` unchanged
-    and no temporary file. A link is replaced, and what it names stays: it may come with a
-    stranger's folder.
+    and no temporary file. A link is replaced, and what it names stays.
     """
     target = Path(path).absolute()
     if target.exists() and not target.is_file():
@@ -71,40 +68,24 @@ def check_regular(path: str | Path) -> None:
         raise InputError(f"{path} is a pipe or a device: put a file in its place.")
 
 
-def read_text(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") -> str:
-    """Read UTF-8 text, with or without a byte order mark.
-
-    Args:
-        path: the file.
-        max_bytes: its size, at most.
-        errors: what to do with other bytes, as for `bytes.decode`.
-    """
-    check_regular(path)
+def read_text(path: Path) -> str:
+    """Read UTF-8 text, with or without a byte order mark."""
     try:
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise InputError(
-                f"{path} has {size:,} bytes where at most {max_bytes:,} are expected: write it "
-                "again."
-            )
-        return path.read_text(encoding="utf-8-sig", errors=errors)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text ({error}): write it again.") from error
+        return path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): write it again.") from error
 
 
-def read_json(path: Path, max_bytes: int = MAX_TEXT, errors: str = "replace") -> Any:
-    """Read a JSON file; for the arguments see `read_text`."""
+def read_json(path: Path) -> Any:
+    """Read a JSON file."""
     if not path.exists():
         raise InputError(f"{path} does not exist: put it there, or name another file.")
-    text = read_text(path, max_bytes, errors)
+    text = read_text(path)
     if not text.strip():
         raise InputError(f"{path} is empty: write it again.")
     try:
         return json.loads(text)
-    # Also numbers of too many digits and nesting that is too deep.
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path} is not JSON ({error}): repair or write it again.") from error
 
 

@@ -16,8 +16,8 @@ from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.overrides import check_overrides
 from asysplat.root import CONF
-from asysplat.runs.checkpoints import build_within, load_weights
-from asysplat.runs.run_config import read_config, using_config
+from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.run_config import read_config
 
 SHIPPED_MODEL = "model=asysplat_plane_sweep"
 
@@ -50,9 +50,7 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
                 f"{checkpoint} has no {config_path}, which describes its model: leave it in the "
                 "folder of its run."
             )
-        model = read_config(config_path).get("model")
-        with using_config(config_path):
-            net = build_within(model, path)
+        net = instantiate(read_config(config_path).model)
     else:
         if not any(override.startswith("model=") for override in overrides):
             overrides = [SHIPPED_MODEL, *overrides]

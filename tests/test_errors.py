@@ -1,7 +1,4 @@
-import pickle
-import warnings
-
-from asysplat.errors import InputError, input_error_behind, plain_warnings
+from asysplat.errors import InputError, input_error_behind
 
 
 def test_the_sentence_behind_other_errors_is_found():
@@ -20,13 +17,3 @@ def test_a_worker_s_traceback_is_left_out():
     )
     sentence = str(input_error_behind(InputError(told)))
     assert sentence == "a.png is empty (0 bytes): copy it again, or leave it out."
-
-
-def test_messages_hold_nothing_that_a_terminal_obeys(monkeypatch):
-    """Names of files and values of options may be a stranger's: colors, cursors, other bytes."""
-    name, shown = "\x1b[2Ja\u202e\udcff\r é\n", "\ufffd[2Ja\ufffd\ufffd\ufffd é\n"
-    error = InputError(f"{name} is empty.")
-    assert str(error) == f"{shown} is empty." == str(pickle.loads(pickle.dumps(error)))
-    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-    plain_warnings()
-    assert warnings.formatwarning(name, UserWarning, "x.py", 1) == f"warning: {shown}\n"

@@ -106,7 +106,7 @@ def measure_scenes(
 def read_result(path: Path) -> SceneResult:
     """Read what `save_result` wrote."""
     try:
-        return SceneResult(**read_json(path, errors="strict"))
+        return SceneResult(**read_json(path))
     except TypeError as error:
         raise InputError(f"{path} is not the result of a scene: remove it.") from error
 

@@ -89,8 +89,7 @@ class AsySplat(TokenNetwork):
             ),
             links=(build_component(coarse_to_fine, shape, fine) for shape in shapes),
         )
-        # `source`, as the weights in checkpoints are named.
-        self.source = build_component(
+        self.fusion = build_component(
             fusion, widths.stages[-1], widths.fine, patch_coarse // patch_fine
         )
         self.head = build_component(head, widths.stages[-1], patch_coarse, patch_fine)
@@ -112,7 +111,7 @@ class AsySplat(TokenNetwork):
             fine = appearance(fine, skip_layers)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = fine_to_coarse(coarse, fine), coarse_to_fine(fine, coarse)
-        return self.source(coarse, fine)  # [B, V, H / p_f, W / p_f, d], or of p_c
+        return self.fusion(coarse, fine)  # [B, V, H / p_f, W / p_f, d], or of p_c
 
     @property
     def skippable_layers(self) -> Collection[nn.Module]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.errors import InputError, printable
+from asysplat.errors import InputError
 from asysplat.runs.run_config import read_config
 from asysplat.runs.runs import RESULTS, SCENE, find_reconstructions, folder_of
 
@@ -43,5 +43,5 @@ def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     for key, value in taken.items():
         if key not in kept:
             OmegaConf.update(config, key, value)
-    print(printable(f"goes on from {folder}, on the photographs {config.path}"))
+    print(f"goes on from {folder}, on the photographs {config.path}")
     return config

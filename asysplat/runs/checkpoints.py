@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
-from omegaconf import DictConfig
 from safetensors import safe_open
 from safetensors.torch import load
 from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
-from asysplat.models.network import Network
 from asysplat.root import CHECKPOINTS
-from asysplat.runs.old_names import upgrade_checkpoint
 from asysplat.runs.run_config import flat_options
 
 SHIPPED = CHECKPOINTS / "asysplat_plane_sweep.safetensors"
@@ -93,8 +89,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names.
     """
     try:
-        metadata = torch.load(path, map_location="meta", mmap=True, weights_only=True)
-        return upgrade_checkpoint(metadata)
+        return torch.load(path, map_location="meta", mmap=True, weights_only=True)
     except Exception as error:
         raise InputError(
             f"{path} cannot be read as a checkpoint to resume from: name a .ckpt file that a run "
@@ -152,20 +147,6 @@ def check_checkpoint(path: Path, module: nn.Module) -> None:
         f"{', '.join(lines[:5])}{', ...' if len(lines) > 5 else ''}; give the options that "
         "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
     )
-
-
-def build_within(model: DictConfig, checkpoint: Path) -> Network:
-    """Build the network of a run, whose sizes may be a stranger's: first without memory."""
-    with torch.device("meta"):
-        planned = instantiate(model)
-    if not isinstance(planned, Network):
-        raise InputError(f"the model is a {type(planned).__name__}, not a network")
-    size, count = checkpoint.stat().st_size, sum(p.numel() for p in planned.parameters())
-    if size < count:
-        raise InputError(
-            f"the model has {count:,} weights and {checkpoint} {size:,} bytes: copy the run again."
-        )
-    return instantiate(model)
 
 
 def load_weights(path: str | None, module: nn.Module, option: str = "init_path") -> None:

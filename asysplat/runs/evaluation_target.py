@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
 from asysplat.runs.ranges import check_ranges, is_number, is_whole
-from asysplat.runs.run_config import plain_options, read_config, using_config
+from asysplat.runs.run_config import plain_options, read_config
 from asysplat.runs.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
 from asysplat.runs.systems import contents_below, describe_system
 
@@ -33,7 +33,6 @@ class EvaluationTarget:
     """What an evaluation measures."""
 
     config: DictConfig  # as train.py takes it; its init_path names the weights
-    file: Path | None  # where a run's stands; None: that of the command
     system: str | None  # the one of SYSTEMS that is given; None: a network
     folder: Path  # for the results
     fingerprint: dict[str, str | int]  # everything that the results depend on
@@ -82,7 +81,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
         stem, made_of = _describe_source(system, options, overrides)
         fingerprint |= describe_system(config, options.system or stem, made_of)
     folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(fingerprint)[:8]}"
-    return EvaluationTarget(config, None, system, folder, fingerprint)
+    return EvaluationTarget(config, system, folder, fingerprint)
 
 
 def _describe_source(
@@ -130,14 +129,10 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
                 f"leave it out, or give init_path={checkpoint} and the run's options instead of "
                 "run."
             )
-    file = folder / "config.yaml"
-    config = read_config(file)
+    config = read_config(folder / "config.yaml")
     config.init_path = str(checkpoint)
-    with using_config(file):
-        check_ranges(config)
-        config.trainer.accelerator = options.trainer.accelerator
-        fingerprint = _describe(config, options)
-    return EvaluationTarget(config, file, None, folder, fingerprint)
+    config.trainer.accelerator = options.trainer.accelerator
+    return EvaluationTarget(config, None, folder, _describe(config, options))
 
 
 def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:

@@ -5,7 +5,6 @@ import json
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, reduce
 from operator import getitem
@@ -18,7 +17,6 @@ from omegaconf import MISSING, DictConfig, open_dict
 from asysplat.data.build import tested_sets
 from asysplat.errors import InputError
 from asysplat.runs.checkpoints import weights_file
-from asysplat.runs.old_names import FORMAT
 from asysplat.runs.revision import revision
 from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
@@ -38,7 +36,12 @@ NOT_HASHED = (
     *("allow_missing_losses", "training.loss.allow_missing"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
-    *("data.micro_batch", "training.checkpoint_layers", "training.views_at_once"),
+    *(
+        "trainer.num_sanity_val_steps",
+        "data.micro_batch",
+        "training.checkpoint_layers",
+        "training.views_at_once",
+    ),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
@@ -48,7 +51,7 @@ class Run:
     """A finished run."""
 
     folder: Path
-    config_hash: str  # by today's code, see the function `config_hash`
+    config_hash: str  # see the function `config_hash`
     seed: int
     revision: str  # revision of the code that made it
     results: dict[str, Any]  # content of metrics.json and, if there is one, evaluation.json
@@ -95,17 +98,6 @@ def hashed_options(
     resolved["init_path"] = resolved["init_path"] is not None
     for key in ("test_root", "disparities"):
         resolved["data"][key] = resolved["data"].get(key) is not None
-    speed = resolved.get("speed") or {}
-    if not any(value for key, value in speed.items() if key != "_target_"):
-        resolved.pop("speed", None)  # exact, as every run was before the option existed
-    resolved["trainer"]["num_sanity_val_steps"] = 0  # changes no number; every run before had 0
-    data = resolved["data"]
-    if data.get("first_window") is None:  # as every run was before the options existed
-        data.pop("first_window", None)
-        data.pop("growth_steps", None)
-    depth_term = resolved["training"]["loss"]["depth_term"]
-    if depth_term.get("stride") == 2:  # as in every run before the option existed
-        depth_term.pop("stride")
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
@@ -157,7 +149,7 @@ def hash_of(values: object) -> str:
 
 
 def describe_run(config: DictConfig) -> dict[str, str | int]:
-    """Describe a run for metrics.json: hash, seed, revision, machine, format and `data_of`."""
+    """Describe a run for metrics.json: hash, seed, revision, machine and `data_of`."""
     gpus = torch.cuda.device_count()
     machine = f"{gpus} x {torch.cuda.get_device_name()}" if gpus else f"{os.cpu_count()} CPU cores"
     return {
@@ -165,7 +157,6 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
         "run/seed": config.seed,
         "run/revision": revision(),
         "run/machine": f"{machine}, torch {torch.__version__}",
-        "run/format": FORMAT,
         **data_of(config),
     }
 
@@ -177,8 +168,8 @@ def find_runs(logs: Path) -> Iterator[Run]:
             continue
         try:
             results = read_results(path)
-            hash_now = _config_hash_now(path.parent, results)
-            seed, commit = results["run/seed"], results["run/revision"]
+            described = (results[f"run/{key}"] for key in ("config_hash", "seed", "revision"))
+            run = Run(path.parent, *described, results)
             extra = path.with_name(EVALUATION)
             if extra.exists():
                 results.update(read_results(extra))
@@ -187,7 +178,7 @@ def find_runs(logs: Path) -> Iterator[Run]:
                 f"{path} is not the results of a finished run: it is left out.", stacklevel=2
             )
             continue
-        yield Run(path.parent, hash_now, seed, commit, results)
+        yield run
 
 
 def find_reconstructions(logs: Path) -> list[Path]:
@@ -229,16 +220,6 @@ def folder_of(
                 f"run={run} has no {file}: name the folder of a finished run, or last."
             )
     return folder
-
-
-def _config_hash_now(folder: Path, results: Mapping[str, Any]) -> str:
-    """Return the hash that today's code computes for the configuration of a run."""
-    if results.get("run/format") != FORMAT:
-        with suppress(OSError, ValueError, KeyError, AttributeError):  # no or another configuration
-            config = read_config(folder / "config.yaml")
-            stages = config.get("earlier_stages") or ()
-            return config_hash(config, [read_config(folder / s / "config.yaml") for s in stages])
-    return results["run/config_hash"]
 
 
 def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:

@@ -11,16 +11,10 @@ from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.evaluation.metrics import METRICS
 from asysplat.files import atomic_write, read_json
-from asysplat.runs.old_names import upgrade_results
-from asysplat.runs.ranges import is_number, is_whole
 from asysplat.terminal import make_console, print_table
 
-MAX_BYTES = 2**20  # of metrics.json, which has 2 KB
-MAX_NUMBER = 1e12  # in metrics.json
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
 RESIDUAL = f"{TESTED}residual"  # largest error of cameras that were fitted to their scenes
-TEXTS = ("run/", "evaluation/", "protocol/")  # groups of results that are texts
-WHOLE = tuple(f"{group}/{name}" for group in ("run", "evaluation") for name in ("seed", "format"))
 Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 
 # Title of a row: prefix of its keys, with a place for the test set.
@@ -43,24 +37,11 @@ def write_json(path: Path, results: Results) -> None:
 
 
 def read_results(path: Path) -> Results:
-    """Read what `write_json` wrote, under today's names; it may be a stranger's."""
-    results = read_json(path, MAX_BYTES, "strict")
+    """Read what `write_json` wrote."""
+    results = read_json(path)
     if not isinstance(results, dict):
         raise InputError(f"{path} is not the results of a run: copy the run again.")
-    for key, value in results.items():
-        if key.startswith(TESTED) and key != RESIDUAL:  # options of any type, only compared
-            continue
-        if key in WHOLE:
-            fits, expected = is_whole(value), "a whole number"
-        elif key.startswith(TEXTS):
-            fits, expected = isinstance(value, str), "a text"
-        else:
-            fits = value is None or (is_number(value) and abs(value) < MAX_NUMBER)
-            expected = "a number"
-        if not fits:
-            found = f"{value!r:.60}"
-            raise InputError(f"{path} has {found} as {key}, not {expected}: copy the run again.")
-    return upgrade_results(results)
+    return results
 
 
 def metric_cells(results: Results, prefix: str, metrics: Iterable[str] = METRICS) -> list[str]:

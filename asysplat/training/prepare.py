@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.errors import InputError, brief, input_error_behind, printable
+from asysplat.errors import InputError, brief, input_error_behind
 from asysplat.models.early_exit import EarlyExit
 from asysplat.runs.checkpoints import (
     check_checkpoint,
@@ -91,7 +91,7 @@ class TrainingStage:
         module.save_hyperparameters(options, logger=False)
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
-            _say(f"not as before: {printable(difference)}")
+            _say(f"not as before: {difference}")
         cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from asysplat.runs.checkpoints import LAST, PREVIOUS, atomic_save
-from asysplat.runs.old_names import upgrade_checkpoint
 from asysplat.runs.revision import revision
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
 from asysplat.training.tensorboard import event_files
@@ -167,13 +166,10 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically, reads those of earlier versions under today's names."""
+    """Writes checkpoints atomically."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
     ) -> None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         atomic_save(checkpoint, Path(path))
-
-    def load_checkpoint(self, *args: Any, **options: Any) -> dict[str, Any]:
-        return upgrade_checkpoint(super().load_checkpoint(*args, **options))
