@@ -57,6 +57,12 @@ def make_folder(path: Path, option: str) -> None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
 
 
+def check_exists(path: Path, expected: str) -> None:
+    """Check that a path exists; `expected` says what to name instead."""
+    if not path.exists():
+        raise InputError(f"{path} does not exist: name {expected}.")
+
+
 def has_file(path: Path) -> bool:
     """Return whether a file exists; False for a name that is too long for any."""
     return os.path.isfile(path)  # Path.is_file raises OSError

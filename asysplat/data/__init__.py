@@ -1,24 +1,20 @@
 """Posed images, synthetic or from files, as batches of training and evaluation tasks."""
 
-from asysplat.data.augment import Augmentation
-from asysplat.data.build import files_data, procedural_data
-from asysplat.data.cache import ImageCache
-from asysplat.data.datamodule import SceneDataModule
-from asysplat.data.procedural import ProceduralScene
-from asysplat.data.readers import find_scenes, open_scene
-from asysplat.data.sequence import SceneOptions
-from asysplat.data.sources import FilesSource, ProceduralSource
+from asysplat.later import import_later
 
-__all__ = [
-    "Augmentation",
-    "FilesSource",
-    "ImageCache",
-    "ProceduralScene",
-    "ProceduralSource",
-    "SceneDataModule",
-    "SceneOptions",
-    "files_data",
-    "find_scenes",
-    "open_scene",
-    "procedural_data",
-]
+LATER = {
+    "Augmentation": "asysplat.data.augment",
+    "FilesSource": "asysplat.data.sources",
+    "ImageCache": "asysplat.data.cache",
+    "ProceduralScene": "asysplat.data.procedural",
+    "ProceduralSource": "asysplat.data.sources",
+    "SceneDataModule": "asysplat.data.datamodule",
+    "SceneOptions": "asysplat.data.sequence",
+    "files_data": "asysplat.data.build",
+    "find_scenes": "asysplat.data.readers",
+    "open_scene": "asysplat.data.readers",
+    "procedural_data": "asysplat.data.build",
+}
+
+__all__ = list(LATER)
+__getattr__ = import_later(__name__, LATER)

@@ -9,7 +9,7 @@ from typing import Any
 
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.data.sequence import SceneOptions
-from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task
+from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task, has_root, tested_sets
 from asysplat.errors import InputError
 
 SIZE = ("height", "width")
@@ -42,7 +42,7 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
     missing = [
         name
         for name, changes in (test_sets or {}).items()
-        if _has_root(changes) and changes["root"] is None and name != options["name"]
+        if has_root(changes) and changes["root"] is None and name != options["name"]
     ]
     if missing:
         warnings.warn(
@@ -96,28 +96,6 @@ def _data_module(
                 )
         sets[test_set] = partial(_test_tasks, make_source, **{**main, **changes})
     return SceneDataModule(source=make_source(**scenes), test_sets=sets, **size, **module)
-
-
-def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
-    """Choose the further test sets of a configuration that a run tests.
-
-    A set without a root of its own is always tested. One with a root is tested only by data on
-    disk, if the root is given and the set has another name than the data.
-
-    Args:
-        test_sets: name -> the options in which it differs from the data set.
-        name: name of the data set.
-        on_disk: whether the data set is read from disk.
-    """
-    return {
-        test_set: options
-        for test_set, options in (test_sets or {}).items()
-        if not _has_root(options) or (on_disk and options["root"] is not None and test_set != name)
-    }
-
-
-def _has_root(options: Any) -> bool:
-    return isinstance(options, Mapping) and "root" in options
 
 
 def _test_tasks(

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.data import open_scene
 from asysplat.data.bad_images import Policy
 from asysplat.data.cameras import CameraOptions, find_missing, refine_given
 from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
+from asysplat.data.readers import open_scene
 from asysplat.data.selection.views import evenly_spaced
 from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError

@@ -1,10 +1,10 @@
 """Sources of tasks: which sequences train, validate and test, and which of their images."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -277,3 +277,25 @@ class FilesSource:
                 "python -m asysplat.data.selection."
             )
         return tasks
+
+
+def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
+    """Choose the further test sets of a configuration that a run tests.
+
+    A set without a root of its own is always tested. One with a root is tested only by data on
+    disk, if the root is given and the set has another name than the data.
+
+    Args:
+        test_sets: name -> the options in which it differs from the data set.
+        name: name of the data set.
+        on_disk: whether the data set is read from disk.
+    """
+    return {
+        test_set: options
+        for test_set, options in (test_sets or {}).items()
+        if not has_root(options) or (on_disk and options["root"] is not None and test_set != name)
+    }
+
+
+def has_root(options: Any) -> bool:
+    return isinstance(options, Mapping) and "root" in options

@@ -12,12 +12,10 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models import alexnet, get_model_weights, vgg16, vgg19
 
 from asysplat.errors import InputError
 
 Backbone = Literal["alexnet", "vgg16", "vgg19", "matconvnet_vgg19"]
-BUILDERS = {"alexnet": alexnet, "vgg16": vgg16, "vgg19": vgg19, "matconvnet_vgg19": vgg19}
 # In torch's hub cache: torchvision's files, whose part after the dash is a hash, and Long-LRM's.
 HUB_FILES = {
     "alexnet": "alexnet-owt-*.pth",
@@ -72,6 +70,8 @@ def _read(name: str, path: Path) -> Any:
 
 
 def _download(name: str) -> dict[str, Tensor]:
+    from torchvision.models import get_model_weights
+
     matconvnet = name == "matconvnet_vgg19"
     weights = None if matconvnet else get_model_weights(name).IMAGENET1K_V1
     url = MATCONVNET_URL if matconvnet else weights.url
@@ -91,7 +91,7 @@ def _download(name: str) -> dict[str, Tensor]:
 
 def _features(name: str, state: object, source: Path) -> dict[str, Tensor]:
     with torch.device("meta"):
-        expected = BUILDERS[name]().features.state_dict(prefix="features.")
+        expected = _layers(name).state_dict(prefix="features.")
     for key, tensor in expected.items():
         loaded = state.get(key) if isinstance(state, dict) else None
         if not isinstance(loaded, Tensor) or loaded.shape != tensor.shape:
@@ -100,6 +100,13 @@ def _features(name: str, state: object, source: Path) -> dict[str, Tensor]:
                 f"give ImageNet weights of {name}, as torchvision names them."
             )
     return {key: state[key].half().float() for key in expected}
+
+
+def _layers(name: Backbone) -> nn.Sequential:
+    """Build a network's convolutions; importing torchvision takes as long as torch."""
+    from torchvision.models import get_model
+
+    return get_model(name.removeprefix("matconvnet_")).features
 
 
 class VGGFeatures(nn.Module):
@@ -124,7 +131,7 @@ class VGGFeatures(nn.Module):
         super().__init__()
         # On meta, because torchvision would also fill 124 M classifier weights at random.
         with torch.device("meta"):
-            layers = BUILDERS[name]().features[: taps[-1] + 1]
+            layers = _layers(name)[: taps[-1] + 1]
         if mean_pooling:
             pooled = [isinstance(layer, nn.MaxPool2d) for layer in layers]
             layers = [nn.AvgPool2d(2) if p else x for p, x in zip(pooled, layers, strict=True)]

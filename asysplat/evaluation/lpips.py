@@ -4,10 +4,9 @@ import warnings
 from pathlib import Path
 from typing import Literal
 
-import lpips
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from asysplat.evaluation.backbones import find_backbone
 from asysplat.kernels.precision import without_autocast
@@ -17,7 +16,7 @@ MIN_SIDE = 32  # pixels
 
 def load_lpips(
     net: Literal["alex", "vgg"], backbone_dir: Path | None, download: bool = False
-) -> lpips.LPIPS | None:
+) -> nn.Module | None:
     """Build the frozen LPIPS network, or return None if its backbone is not on this machine.
 
     The linear heads come with the lpips package.
@@ -27,6 +26,8 @@ def load_lpips(
         backbone_dir: folder that may hold the backbone's weights, see `find_backbone`.
         download: whether to download missing weights.
     """
+    import lpips  # not above: it imports torchvision, which takes as long as torch
+
     backbone = find_backbone("alexnet" if net == "alex" else "vgg16", backbone_dir, download)
     if backbone is None:
         return None
@@ -47,7 +48,7 @@ def load_lpips(
 
 
 def lpips_distance(
-    network: lpips.LPIPS,
+    network: nn.Module,
     rendered: Float[Tensor, "*batch V 3 H W"],
     target: Float[Tensor, "*batch V 3 H W"],
 ) -> Float[Tensor, "*batch V"]:

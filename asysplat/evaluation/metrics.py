@@ -6,7 +6,6 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from asysplat.errors import InputError
 from asysplat.kernels.precision import without_autocast
@@ -54,6 +53,9 @@ def ssim(
         covariance: weighted sum of the products of deviations within a window ("biased"), or this
             sum times n / (n - 1) for its n pixels ("sample"), as in scikit-image.
     """
+    # Not above: importing torchmetrics takes longer than torch.
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     height, width = rendered.shape[-2:]
     check_ssim_size(height, width, window)
     size = SSIM_WINDOWS[window]

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
-from lpips import LPIPS
-from torch import Tensor
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import CostMeter
@@ -65,7 +64,7 @@ class PostOptimization:
 
     steps: Sequence[int]
     protocol: Protocol
-    lpips: LPIPS | None
+    lpips: nn.Module | None
     background: Float[Tensor, "3"] | None = None
     backgrounds: Mapping[str, Float[Tensor, "3"]] = field(default_factory=dict)
 

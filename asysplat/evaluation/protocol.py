@@ -5,8 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
 
 from jaxtyping import Float
-from lpips import LPIPS
-from torch import Tensor
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation import metrics
@@ -72,7 +71,7 @@ class Protocol:
         return metrics.psnr(self._prepare(rendered, targets), targets.images)
 
     def image_metrics(
-        self, rendered: Images, targets: Views, lpips: LPIPS | None
+        self, rendered: Images, targets: Views, lpips: nn.Module | None
     ) -> dict[str, PerView]:
         """Compute PSNR, SSIM and LPIPS of each image.
 
@@ -117,7 +116,7 @@ class Protocol:
         rendered: Float[Tensor, "V 3 H W"],
         depths: Float[Tensor, "V H W"] | None,
         targets: Views,
-        lpips: LPIPS | None,
+        lpips: nn.Module | None,
         psnr_only: bool = False,
     ) -> list[dict[str, float]]:
         """Compute the metrics of each view by itself, as SSIM of many takes much memory.
@@ -141,7 +140,7 @@ class Protocol:
         return rows
 
     def measure_baselines(
-        self, inputs: Views, targets: Views, lpips: LPIPS | None, psnr_only: bool = False
+        self, inputs: Views, targets: Views, lpips: nn.Module | None, psnr_only: bool = False
     ) -> dict[str, list[dict[str, float]]]:
         """Compute the metrics of each of BASELINES, by name; see `measure_views`."""
         return {

@@ -4,12 +4,17 @@ asysplat export scene.ply scene.spz
 """
 
 from argparse import ArgumentParser
+from pathlib import Path
+
+from asysplat.cli import exit_with_message
+from asysplat.files import check_exists
 
 if __name__ == "__main__":  # now, since torch takes seconds
     parser = ArgumentParser("asysplat export", description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="a file of Gaussians")
+    parser.add_argument("scene", type=Path, help="a file of Gaussians")
     parser.add_argument(
         "output",
+        type=Path,
         help="the new file: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors or .html",
     )
     parser.add_argument(
@@ -17,10 +22,10 @@ if __name__ == "__main__":  # now, since torch takes seconds
     )
     parser.add_argument("--sh", type=int, choices=range(4), help="highest degree of SH to keep")
     arguments = parser.parse_args()
+    with exit_with_message("stopped."):
+        check_exists(arguments.scene, "a file of Gaussians")
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 from asysplat.errors import InputError
 from asysplat.export.gaussians import (
@@ -76,7 +81,5 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
 
 if __name__ == "__main__":
     handle_signals()
-    try:
-        export(Path(arguments.scene), Path(arguments.output), arguments.keep, arguments.sh)
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    with exit_with_message("stopped."):
+        export(arguments.scene, arguments.output, arguments.keep, arguments.sh)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from omegaconf import MISSING, DictConfig, open_dict
 
-from asysplat.data.build import tested_sets
+from asysplat.data.sources import tested_sets
 from asysplat.errors import InputError
 from asysplat.runs.checkpoints import weights_file
 from asysplat.runs.revision import revision

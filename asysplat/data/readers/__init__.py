@@ -39,7 +39,7 @@ from asysplat.data.readers.masks import with_masks
 from asysplat.data.readers.panoramas import with_faces
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
-from asysplat.files import check_regular
+from asysplat.files import check_exists, check_regular
 
 MAX_NAME = 200  # characters of a path in a message
 # In this order: the first layout that fits a folder reads it.
@@ -72,8 +72,7 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
             scenes = LAYOUTS[name].find_scenes(root)
         if scenes:
             return name, scenes
-    if not root.exists():
-        raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
+    check_exists(root, "a scene, or a folder of scenes")
     if root.is_file() and root.suffix.lower() in SUFFIXES:
         raise InputError(f"{root} is one photograph: name the folder of all.")
     if layout == "auto" and (bare := _bare(root)):
