@@ -14,16 +14,21 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: idle threads must not spin
 
-from asysplat.cli import check_command, command
-from asysplat.overrides import as_overrides
+from omegaconf import DictConfig, OmegaConf
+
+from asysplat.cli import check_command, command, exit_with_message
+from asysplat.files import check_exists
+from asysplat.overrides import name_path
 
 if __name__ == "__main__":
-    sys.argv[1:] = as_overrides(sys.argv[1:])
-    check_command("reconstruct")
+    sys.argv[1:] = name_path(sys.argv[1:])
+    asked = check_command("reconstruct")
+    if asked is not None and not OmegaConf.is_missing(asked, "path"):
+        with exit_with_message("stopped."):
+            check_exists(Path(asked.path), "a scene, or a folder of scenes")
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
 
 from asysplat import load
 from asysplat.data.cameras import CameraOptions

@@ -5,7 +5,6 @@ asysplat reconstruct my_scene
 
 import difflib
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 
@@ -25,7 +24,6 @@ COMMANDS = {
     "benchmark": ("benchmark.py", "run time against error"),
     "doctor": ("asysplat.doctor", "what this machine has, and what is missing"),
 }
-COMPLETION = ("-sc", "--shell-completion")
 
 
 def main() -> None:
@@ -35,8 +33,6 @@ def main() -> None:
         print(usage())
     elif name == "--version":
         print(__version__)
-    elif name in COMPLETION:
-        complete(words)
     elif name in COMMANDS:
         start(name, words)
     else:
@@ -48,14 +44,8 @@ def usage() -> str:
     """Write the commands, a line each."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {purpose}" for name, (_, purpose) in COMMANDS.items()]
-    return "\n".join(
-        [
-            "asysplat COMMAND [option=value ...]",
-            *("", *lines, ""),
-            'asysplat COMMAND --help shows its options; eval "$(asysplat -sc install=bash)" '
-            "completes them.",
-        ]
-    )
+    ending = "asysplat COMMAND --help shows its options."
+    return "\n".join(["asysplat COMMAND [option=value ...]", "", *lines, "", ending])
 
 
 def start(name: str, words: Sequence[str]) -> None:
@@ -64,23 +54,6 @@ def start(name: str, words: Sequence[str]) -> None:
     # -P: a module of the working directory does not hide an installed one.
     code = [str(ROOT / target)] if target.endswith(".py") else ["-P", "-m", target]
     os.execv(sys.executable, [sys.executable, *code, *words])
-
-
-def complete(words: Sequence[str]) -> None:
-    """Complete the first word by the commands, and the others by Hydra's own completion."""
-    line = os.environ.get("COMP_LINE", "")
-    typed = shlex.split(line) + [""] * line.endswith(" ")
-    if len(typed) > 2 and typed[1] in COMMANDS and COMMANDS[typed[1]][0].endswith(".py"):
-        # Hydra's completion knows lines without the command.
-        rest = line.split(typed[1], 1)[1].lstrip()
-        os.environ["COMP_LINE"] = f"asysplat {rest}"
-        start(typed[1], [COMPLETION[0], *words])
-    if not line:  # install=bash
-        import hydra
-
-        hydra.main(version_base="1.3")(lambda _: None)()
-    elif len(typed) == 2:
-        print(" ".join(name for name in COMMANDS if name.startswith(typed[1])))
 
 
 if __name__ == "__main__":

@@ -6,15 +6,14 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import zip_longest
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.errors import InputError, cause_of, input_error_behind, plain_warnings
+from asysplat.errors import cause_of, input_error_behind, plain_warnings
 from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
 from asysplat.overrides import check_overrides, quote_paths
 from asysplat.root import CONF, ROOT, typed
@@ -23,29 +22,26 @@ OmegaConf.register_new_resolver("typed", typed, replace=True)  # in the texts of
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def check_command(script: str) -> None:
-    """Check this process's command line; exit with the message on an error.
+def check_command(script: str) -> DictConfig | None:
+    """Check this process's command line and compose it; exit with the message on an error.
 
     A script calls it before it imports torch, which takes seconds; --help needs none. Ctrl-C then
-    ends the process.
+    ends the process. A configuration of another folder is left to Hydra: None.
     """
     end_at_interrupt()
     os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
-    words = sys.argv[1:] = quote_paths(sys.argv[1:])
-    args, unknown = get_args_parser().parse_known_args(words)
-    other_files = args.config_dir or args.config_name or args.config_path
+    sys.argv[1:] = quote_paths(sys.argv[1:])
+    args = get_args_parser().parse_args()
     if args.help:  # what Hydra prints, without the second that composing takes
         print(OmegaConf.load(CONF / f"{script}.yaml").hydra.help.template)
         sys.exit()
     if args.hydra_help or args.shell_completion:
         hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")(lambda _: None)()
         sys.exit()
-    try:
-        _check_dashes(words, unknown)
-        if not other_files:
-            check_overrides(args.overrides, script)
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    if args.config_dir or args.config_name or args.config_path:
+        return None
+    with exit_with_message("stopped."):
+        return check_overrides(args.overrides, script)
 
 
 def command(
@@ -146,14 +142,3 @@ def _is_out_of_memory(error: BaseException) -> bool:
         return error.errno == errno.ENOMEM
     words = ("DefaultCPUAllocator: can't allocate memory", "can't start new thread")
     return isinstance(error, RuntimeError) and any(word in str(error) for word in words)
-
-
-def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:
-    """Raise InputError if some of `words`, as in `--steps 20`, is `unknown` to Hydra."""
-    for word, following in zip_longest(words, words[1:], fillvalue=""):
-        if word in unknown and word.startswith("-"):
-            name, _, value = word.partition("=")
-            if not value and following and not re.match("-|.*=", following):
-                value, word = following, f"{word} {following}"
-            override = f"{name.lstrip('-').replace('-', '_')}={value or 'true'}"
-            raise InputError(f"{word}: options are given as {override}.")

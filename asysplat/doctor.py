@@ -20,7 +20,7 @@ from asysplat.root import ROOT, __version__
 from asysplat.runs.revision import revision
 
 EXTRAS = {
-    "viewer": "asysplat view, --view",
+    "viewer": "asysplat view, view=true",
     "video": "videos, in and out",
     "heif": "photographs as phones save them",
     "spz": "SPZ of version 4",

@@ -13,9 +13,8 @@ from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.runs.run_config import plain_options
-from asysplat.runs.runs import Run, config_hash, data_of, differences, find_runs
+from asysplat.runs.runs import CHOICES, Run, config_hash, data_of, differences, find_runs
 from asysplat.runs.stages import describe_stage, stage_configs
-from asysplat.training.tensorboard import CHOICES
 from paper.notes import data_text, rows_by_text
 from paper.systems import system_rows
 from paper.tables import (

@@ -59,10 +59,11 @@ def test_other_errors_have_no_message(error):
 
 
 @pytest.mark.parametrize("script", ["benchmark", "evaluate", "reconstruct", "report", "train"])
-def test_a_script_takes_a_command_without_options(script, monkeypatch):
+def test_a_script_takes_a_command_without_options(script, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{script}.py"])
     monkeypatch.setattr("asysplat.cli.end_at_interrupt", lambda: None)
     check_command(script)
     monkeypatch.setattr("sys.argv", [f"{script}.py", "--steps", "20"])
-    with pytest.raises(SystemExit, match="--steps 20: options are given as steps=20"):
+    with pytest.raises(SystemExit):
         check_command(script)
+    assert "unrecognized arguments: --steps" in capsys.readouterr().err

@@ -24,7 +24,7 @@ def test_without_a_checkpoint_it_is_untrained():
 
 @pytest.mark.parametrize(
     ("overrides", "says"),
-    [(["model.layer=8m"], "model.layer is unknown"), (["model.layers=8m"], "do not fit")],
+    [(["model.layer=8m"], "did you mean model.layers"), (["model.layers=8m"], "do not fit")],
 )
 def test_overrides_that_cannot_be_are_named(overrides, says):
     with pytest.raises(InputError, match=says):

@@ -96,7 +96,7 @@ def test_every_command_shows_its_options(run, name):
 def test_the_doctor_names_versions_and_what_is_missing(run):
     lines = dict(line.split(maxsplit=1) for line in run("asysplat", "doctor").splitlines())
     assert lines["torch"].startswith(version("torch")) and lines["asysplat"].endswith("installed")
-    assert lines["viewer"] == "asysplat view, --view"
+    assert lines["viewer"] == "asysplat view, view=true"
 
 
 def test_words_are_completed(run, monkeypatch):

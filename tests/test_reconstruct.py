@@ -402,22 +402,20 @@ def script(repository, monkeypatch):
     signal.signal(signal.SIGINT, on_interrupt)
 
 
-def test_as_overrides_names_the_path_and_reads_view_flags(script):
+def test_the_first_word_is_the_path(script):
     for words, expected in (
         ("scene", "path='scene'"),
-        ("scene seconds=5 --view", "path='scene' seconds=5 view=true"),
-        ("--view scene", "path='scene' view=true"),
-        ("scene --open --view", "path='scene' open=true view=true"),
+        ("scene seconds=5", "path='scene' seconds=5"),
         ("path=scene view=true", "path=scene view=true"),
         ("--cfg job", "--cfg job"),
         ("", ""),
     ):
-        assert script.as_overrides(words.split()) == expected.split()
+        assert script.name_path(words.split()) == expected.split()
 
 
 REFUSED = {
     "": "no photographs: python reconstruct.py my_scene",
-    "heigth=9": "heigth is unknown: did you mean height?",
+    "heigth=9": "'heigth': did you mean height?",
     "last_fit=2": "last_fit=2: give a number from 0 to 1",
     "init=absent.ply": "absent.ply",
     "video.height=0": "video.height=0: give a whole number from 2 to 4320, or null for the",

@@ -1,19 +1,18 @@
-"""What a stranger's files, arguments and commands may hold ends with a sentence that names it."""
+"""What files, arguments and commands may hold by mistake ends with a sentence that names it."""
 
-import json
 import subprocess
 import sys
 import warnings
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
 import asysplat
 from asysplat import load, read_gaussians, refine
-from asysplat.data import ProceduralScene, SceneOptions, open_scene, photographs
+from asysplat.__main__ import COMMANDS as COMMANDS_OF_THE_PROJECT
+from asysplat.data import ProceduralScene, SceneOptions, photographs
 from asysplat.data.bad_images import BadImages
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -36,72 +35,6 @@ def views():
 def scene(views, tmp_path):
     write_transforms(views, tmp_path / "scene")
     return tmp_path / "scene"
-
-
-NUMBERS = {"5,000 digits": "9" * 5000, "10^400": "1" + "0" * 400, "1e400": "1e400"}
-
-
-@pytest.mark.parametrize("key", ["w", "fl_x", "cx"])
-@pytest.mark.parametrize("number", NUMBERS)
-def test_numbers_beyond_a_float_are_refused_with_the_file_s_name(scene, key, number):
-    edit(scene, **{key: "here"}, text=('"here"', NUMBERS[number]))
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        open_scene(scene, SIZE).views([0])
-
-
-@pytest.mark.parametrize("values", [{"k1": 1e300}, {"cx": 1e30}, {"fl_x": 1e30, "fl_y": 1e30}])
-def test_impossible_lenses_are_refused_with_the_file_s_name(scene, values):
-    edit(scene, **values)
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        open_scene(scene, SIZE).views([0]).validate()
-
-
-def test_nesting_too_deep_for_python_is_refused_with_the_file_s_name(scene):
-    (scene / "transforms.json").write_text("[" * 100_000)
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        open_scene(scene, SIZE)
-
-
-def test_file_names_longer_than_any_file_s_are_refused(scene):
-    frames = json.loads((scene / "transforms.json").read_text())["frames"]
-    edit(scene, frames=[frame | {"file_path": "a" * 300 + ".png"} for frame in frames])
-    with pytest.raises(InputError, match="aaa"):
-        open_scene(scene, SIZE)
-
-
-def edit(scene, text=("", ""), **values):
-    """Set values of transforms.json, and then replace text; lenses may be those of frames."""
-    file = scene / "transforms.json"
-    content = json.loads(file.read_text())
-    lenses = {key: value for key, value in values.items() if key != "frames"}
-    content = content | values
-    content["frames"] = [frame | lenses for frame in content["frames"]]
-    file.write_text(json.dumps(content).replace(*text) if text[0] else json.dumps(content))
-
-
-def test_an_npy_header_that_is_no_python(tmp_path, views):
-    header = b"(" * 118
-    (tmp_path / "poses_bounds.npy").write_bytes(
-        b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
-    )
-    (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match=r"poses_bounds\.npy"):
-        open_scene(tmp_path, SIZE)
-
-
-def test_ply_elements_that_no_disk_holds(tmp_path):
-    lines = ["ply", "format binary_little_endian 1.0", f"element camera {10**15}"]
-    lines += ["property float x", "element vertex 1", "property float x", "end_header", ""]
-    (tmp_path / "scene.ply").write_text("\n".join(lines))
-    with pytest.raises(InputError, match=r"scene\.ply"):
-        read_gaussians(tmp_path / "scene.ply")
-
-
-def test_splats_without_a_rotation(tmp_path):
-    row = np.ones(6, np.float32).tobytes() + bytes([255] * 4) + bytes([128] * 4)
-    (tmp_path / "scene.splat").write_bytes(row)
-    with pytest.raises(InputError, match=r"scene\.splat"):
-        read_gaussians(tmp_path / "scene.splat").validate()
 
 
 def test_one_message_lists_some_of_many_errors():
@@ -226,21 +159,48 @@ def test_as_many_photographs_as_memory_holds(scene, monkeypatch):
     assert asysplat.open_photographs(scene, **options).inputs.num_views == 3
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("script", ["train", "reconstruct", "evaluate", "report"])
-def test_a_typo_is_named_before_torch_is_imported(repository, script):
+MISTAKES = {
+    "train pathz.logs=x": "override 'pathz.logs': did you mean paths.logs",
+    "evaluate pathz.logs=x": "override 'pathz.logs': did you mean paths.logs",
+    "report cots=true": "did you mean costs",
+    "reconstruct /nonexistent": "/nonexistent does not exist",
+    "export /nonexistent x.ply": "/nonexistent does not exist",
+    "check /nonexistent": "/nonexistent does not exist",
+}
+
+
+@pytest.mark.parametrize("command", MISTAKES)
+def test_a_mistake_is_named_before_torch_is_imported(repository, command):
+    name, *words = command.split()
+    target = COMMANDS_OF_THE_PROJECT[name][0]
+    run = "run_path" if target.endswith(".py") else "run_module"
     program = f"""
 import runpy, sys
-sys.argv = ["{script}.py", "pathz.logs=x"]
+sys.argv = {[target, *words]}
 try:
-    runpy.run_path("{script}.py", run_name="__main__")
+    runpy.{run}({target!r}, run_name="__main__")
 except SystemExit as end:
-    assert "pathz.logs is unknown" in str(end.code), end.code
-    print("torch" in sys.modules)
+    print(end.code, file=sys.stderr)
+print(sorted({{"torch", "lightning", "numba"}} & set(sys.modules)))
 """
     words = [sys.executable, "-c", program]
     result = subprocess.run(words, cwd=repository, capture_output=True, text=True)
-    assert result.stdout == "False\n", result.stderr
+    assert MISTAKES[command] in result.stderr
+    assert result.stdout == "[]\n", result.stderr
+
+
+# Each takes as long to import as torch.
+HEAVY = {"lightning", "torchmetrics", "torchvision"}
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "report", "export", "check", "view", "cameras"])
+def test_only_training_and_evaluation_import_lightning(repository, name):
+    target = COMMANDS_OF_THE_PROJECT[name][0].removesuffix(".py")
+    module = f"{target}.__main__" if (repository / target.replace(".", "/")).is_dir() else target
+    program = f"import sys, {module}; print(sorted({HEAVY} & set(sys.modules)))"
+    words = [sys.executable, "-c", program]
+    result = subprocess.run(words, cwd=repository, capture_output=True, text=True)
+    assert result.stdout == "[]\n", result.stderr
 
 
 def test_help_begins_with_lines_that_work(repository, scene, tmp_path):

@@ -27,6 +27,13 @@ PICTURE = "contact.png"  # in the folder of a reconstruction
 SCENE = "scene.safetensors"  # there, too; run= goes on from it
 RECONSTRUCTION = ("start.png", PICTURE, SCENE)  # a folder with one of them is a reconstruction's
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
+# The options that tell a run from others, at first sight.
+CHOICES = (
+    *("geometry_ratio", "seed", "learning_rate", "model.layers", "steps"),
+    *("name", "width", "state_size", "metrics.name"),
+    *(f"data.{key}" for key in ("name", "inputs", "height", "width", "batch_size")),
+    *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
+)
 # Names, paths, callbacks, keys that are only interpolated into others, and keys that only split the
 # batch.
 NOT_HASHED = (

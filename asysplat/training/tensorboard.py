@@ -9,13 +9,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.metrics import METRICS
+from asysplat.runs.runs import CHOICES
 
-CHOICES = (
-    *("geometry_ratio", "seed", "learning_rate", "model.layers", "steps"),
-    *("name", "width", "state_size", "metrics.name"),
-    *(f"data.{key}" for key in ("name", "inputs", "height", "width", "batch_size")),
-    *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
-)
 EVENTS = "events.out.tfevents.*"
 TICKED = 5  # number of options that TensorBoard's hparams tab shows at first
 FIRST = ("train", "val", "test", "steps")  # groups of cards

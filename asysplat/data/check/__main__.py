@@ -12,31 +12,48 @@ from argparse import ArgumentParser, Namespace
 from itertools import chain, count
 from pathlib import Path
 
+from asysplat.errors import InputError
+from asysplat.files import check_exists
+
+MAX_SCENES = 3  # checked of a folder of more
+EXPECTED = "a scene, or a folder of scenes"
+
+
+def read_arguments(words: list[str] | None = None) -> Namespace:
+    """Read the command line; exit if there is no such path."""
+    parser = ArgumentParser(prog="asysplat check", description=__doc__)
+    parser.add_argument("path", type=Path, help=f"{EXPECTED}, of which {MAX_SCENES} are checked")
+    parser.add_argument("--layout", default="auto", help="of its files; see data/README.md")
+    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
+    parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
+    arguments = parser.parse_args(words)
+    try:
+        check_exists(arguments.path, EXPECTED)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    return arguments
+
+
+if __name__ == "__main__":  # now, since torch takes seconds
+    given = read_arguments()
+
 from rich.console import Console
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.report import Report, check_scene
 from asysplat.data.check.show import draw_report, print_report
-from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
+from asysplat.data.readers import find_scenes, read_scene
 from asysplat.data.write import refuse_inside
-from asysplat.errors import InputError
 from asysplat.interrupts import handle_signals
 from asysplat.terminal import make_console
 
-MAX_SCENES = 3  # checked of a folder of more
 
-
-def main(arguments: list[str] | None = None) -> int:
-    parser = ArgumentParser(prog="asysplat check", description=__doc__)
-    parser.add_argument(
-        "path", type=Path, help=f"a scene, or a folder of scenes, of which {MAX_SCENES} are checked"
-    )
-    parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
-    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
-    help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
-    parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
+def main(arguments: Namespace) -> int:
+    """Check scenes; return the exit status."""
     try:
-        return check(parser.parse_args(arguments), make_console())
+        return check(arguments, make_console())
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -78,4 +95,4 @@ def save_figure(report: Report, title: str, out: Path) -> Path:
 
 if __name__ == "__main__":
     handle_signals()
-    sys.exit(main())
+    sys.exit(main(given))

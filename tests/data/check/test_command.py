@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from asysplat.data import ProceduralScene
-from asysplat.data.check.__main__ import main
+from asysplat.data.check.__main__ import main, read_arguments
 from asysplat.data.write import write_transforms
 
 HEIGHT, WIDTH, COUNT = 160, 240, 12
@@ -34,7 +34,10 @@ def check(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments) -> tuple[int, str, str]:
-        code = main([str(argument) for argument in arguments])
+        try:
+            code = main(read_arguments([str(argument) for argument in arguments]))
+        except SystemExit as end:
+            code = end.code
         return code, *capsys.readouterr()
 
     return run
