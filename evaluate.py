@@ -48,7 +48,7 @@ from asysplat.runs.evaluation_target import find_target
 from asysplat.runs.runs import EVALUATION
 from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views
-from asysplat.training.messages import quiet_lightning
+from asysplat.training.loggers import quiet_lightning
 
 Predictor = Callable[[Sample], Predict]  # prediction function for a sample's scene
 

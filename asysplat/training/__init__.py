@@ -3,9 +3,8 @@
 from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.module import SplattingModule
-from asysplat.training.muon import Muon
-from asysplat.training.prediction import Prediction
-from asysplat.training.sharded import ShardedStrategy
+from asysplat.training.optimizers import Muon
+from asysplat.training.parallel import Prediction, ShardedStrategy
 
 __all__ = [
     "InputDisparity",

@@ -8,6 +8,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 from torch.distributed.fsdp import FSDPModule, fully_shard
+from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -16,12 +17,9 @@ from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
-from asysplat.training.accumulated_metrics import AccumulatedMetrics
-from asysplat.training.joint_optimizer import JointOptimizer
 from asysplat.training.losses.splatting import SplattingLoss
-from asysplat.training.parallel_scenes import Batch, ParallelScenes
-from asysplat.training.prediction import Prediction
-from asysplat.training.step_timer import StepTimer
+from asysplat.training.optimizers import JointOptimizer
+from asysplat.training.parallel import Batch, ParallelScenes, Prediction
 
 
 class SplattingModule(lightning.LightningModule):
@@ -62,8 +60,7 @@ class SplattingModule(lightning.LightningModule):
         self.optimizer, self.matrix_optimizer = optimizer, matrix_optimizer
         self.schedule = schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
-        self.timer = StepTimer()  # started and stopped by a callback
-        self._parallel_scenes = ParallelScenes(net, self.scene_terms, self.timer)
+        self._parallel_scenes = ParallelScenes(net, self.scene_terms)
         self._accumulated = AccumulatedMetrics(net)
         fixed = None if background == "inputs" else torch.tensor(background, dtype=torch.float32)
         self.register_buffer("background", fixed, persistent=False)
@@ -79,13 +76,11 @@ class SplattingModule(lightning.LightningModule):
     def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
         """Predict the Gaussians of the inputs, by `net` if given; render them at the targets."""
         net = self.net if net is None else net
-        with self.timer("network"):
-            gaussians = net(batch["inputs"], prune=False)
+        gaussians = net(batch["inputs"], prune=False)
         targets, background = batch["targets"], self.background_for(batch)
-        with self.timer("rendering"):
-            options = {"masks": targets.masks, "views_at_once": self.views_at_once, "depth": depth}
-            kept = net.select(gaussians) if batch.get("prune", True) else gaussians
-            rendering = render(kept, targets.cameras, background, **options)
+        options = {"masks": targets.masks, "views_at_once": self.views_at_once, "depth": depth}
+        kept = net.select(gaussians) if batch.get("prune", True) else gaussians
+        rendering = render(kept, targets.cameras, background, **options)
         return Prediction(gaussians, rendering)
 
     def background_for(self, batch: Batch) -> Tensor:
@@ -126,8 +121,7 @@ class SplattingModule(lightning.LightningModule):
         prediction = self(batch, depth=self.loss.needs_depth, net=net)
         targets = batch["targets"]
         image = targets.masked(prediction.rendering.image.detach())
-        with self.timer("loss"):
-            return {**self.loss(prediction, batch), "psnr": psnr(image, targets.images).mean()}
+        return {**self.loss(prediction, batch), "psnr": psnr(image, targets.images).mean()}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:
         return self(batch, depth=True)
@@ -201,3 +195,41 @@ def freeze_unused(net: Network) -> None:
     for parameter, grad in zip(net.parameters(), grads, strict=True):
         if grad is None:
             parameter.requires_grad_(False)
+
+
+class AccumulatedMetrics:
+    """Averages the terms of the loss and the running means of batch norms over an optimizer step.
+
+    Both equal those of one process with the whole batch. Every micro-batch starts from the same
+    running means.
+    """
+
+    def __init__(self, net: nn.Module):
+        norms = [module for module in net.modules() if isinstance(module, _BatchNorm)]
+        self.buffers = [b for norm in norms for b in (norm.running_mean, norm.running_var)]
+        self.terms: list[dict[str, Tensor]] = []
+        self.updated: list[list[Tensor]] = []
+
+    def start(self) -> None:
+        """Begin an optimizer step."""
+        self.before = [buffer.clone() for buffer in self.buffers]
+        self.terms, self.updated = [], []
+
+    def add(self, terms: dict[str, Tensor]) -> None:
+        """Add a micro-batch after its forward pass."""
+        self.terms.append({name: term.detach() for name, term in terms.items()})
+        self.updated.append([buffer.clone() for buffer in self.buffers])
+        self._set(self.before)
+
+    def finish(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        """Update the running means; return the mean of every term; `reduce`: over processes."""
+        updated = zip(*self.updated, strict=True)
+        self._set([reduce(torch.stack(values).mean(0)) for values in updated])
+        names = list(self.terms[0])
+        means = torch.stack([torch.stack([terms[n] for terms in self.terms]).mean() for n in names])
+        return dict(zip(names, reduce(means), strict=True))
+
+    def _set(self, values: list[Tensor]) -> None:
+        for buffer, value in zip(self.buffers, values, strict=True):
+            # By .data, as a batch norm's pending backward pass has saved the buffer.
+            buffer.data.copy_(value)

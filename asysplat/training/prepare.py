@@ -14,6 +14,7 @@ import lightning
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
@@ -42,13 +43,11 @@ from asysplat.runs.stages import (
     stage_configs,
 )
 from asysplat.runs.summary import Results, print_summary, write_json
-from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
-from asysplat.training.callbacks.stage_record import StageRecord
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO, StageRecord
+from asysplat.training.loggers import log_choices, log_results, quiet_lightning
 from asysplat.training.losses.splatting import report_missing
-from asysplat.training.messages import quiet_lightning
 from asysplat.training.module import SplattingModule
 from asysplat.training.run_folder import locked
-from asysplat.training.tensorboard import cut_events, log_choices, log_results
 
 Callbacks = Mapping[str, lightning.Callback]
 _say = rank_zero_only(partial(print, flush=True))  # one process of several speaks
@@ -79,11 +78,7 @@ class TrainingStage:
         data.check_sizes(instantiate(self.config.metrics).check_size)
 
     def load(self, module: SplattingModule) -> None:
-        """Load the weights to start from, and say what is trained.
-
-        A stage that is resumed drops the events that it logged after the checkpoint, since it will
-        log them again.
-        """
+        """Load the weights to start from, and say what is trained."""
         load_weights(self.weights, module)
         _say(f"{self.config.stage}: {describe_stage(self.config)}")
         _say(f"model: {module.net.describe()}")
@@ -92,7 +87,6 @@ class TrainingStage:
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
             _say(f"not as before: {difference}")
-        cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
         """Return the trainer's arguments that conf/trainer does not have, and its accelerator."""
@@ -103,7 +97,7 @@ class TrainingStage:
             # Otherwise Lightning adds its own callbacks.
             "enable_checkpointing": "checkpoints" in callbacks,
             "plugins": [AtomicCheckpointIO()],
-            "enable_progress_bar": "progress" in callbacks,
+            "enable_progress_bar": isinstance(callbacks.get("progress"), ProgressBar),
         }
 
     def begin(self, trainer: lightning.Trainer, data: SceneDataModule) -> None:

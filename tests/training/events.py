@@ -8,24 +8,22 @@ MEASURED = ("cost/", "time/", "memory/")
 
 
 def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Steps and values by tag, in the order in which they were written.
+    """Steps and values by tag; of a step that was repeated after a resume, the last.
 
     What differs from run to run is left out: costs, seconds and memory.
     """
     events = _events(folder)
     tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(MEASURED)]
-    # Files are read in the order of their names, which have the second and then the process.
-    rows = {tag: sorted(events.Scalars(tag), key=lambda event: event.wall_time) for tag in tags}
-    return {tag: [(event.step, event.value) for event in row] for tag, row in rows.items()}
+    rows = {tag: {event.step: event.value for event in events.Scalars(tag)} for tag in tags}
+    return {tag: sorted(row.items()) for tag, row in rows.items()}
 
 
 def steps(folder: Path, kind: str) -> dict[str, list[int]]:
     """Steps by tag, of "scalars", "images" or "histograms"."""
     events = _events(folder)
-    read = {"scalars": events.Scalars, "images": events.Images, "histograms": events.Histograms}[
-        kind
-    ]
-    return {tag: [event.step for event in read(tag)] for tag in events.Tags()[kind]}
+    read = {"scalars": events.Scalars, "images": events.Images, "histograms": events.Histograms}
+    tags = events.Tags()[kind]
+    return {tag: sorted({event.step for event in read[kind](tag)}) for tag in tags}
 
 
 def _events(folder: Path) -> EventAccumulator:

@@ -17,7 +17,6 @@ from asysplat.errors import InputError
 from asysplat.runs.checkpoints import read_metadata
 from asysplat.training.callbacks import Checkpoints
 from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
-from asysplat.training.tensorboard import cut_events
 
 PER_EPOCH = 3
 
@@ -62,7 +61,6 @@ class Module(OneLayer):
 
 def fit(folder, module, steps=7, checkpoint=None, minutes=None):
     """Train with PER_EPOCH steps an epoch, a validation after each."""
-    cut_events(folder, {} if checkpoint is None else read_metadata(checkpoint)["event_files"])
     checkpoints = Checkpoints(
         dirpath=folder / "checkpoints",
         minutes=minutes,

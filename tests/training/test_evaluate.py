@@ -362,7 +362,7 @@ REFUSED = {
         ["refinement=3dgs", "refinement_steps=0.5"],
         "refinement_steps=0.5: give a whole number of at least 1, or null",
     ),
-    "an unknown refinement": (["refinement=nerf"], "refinement=nerf"),
+    "an unknown refinement": (["refinement=nerf"], "refinement/nerf"),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
@@ -373,7 +373,7 @@ REFUSED = {
         "above the one before",
     ),
     "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),
-    "an unknown option": (["ryn=last"], "ryn is unknown"),
+    "an unknown option": (["ryn=last"], "override 'ryn'"),
 }
 
 

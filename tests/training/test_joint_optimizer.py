@@ -6,10 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from asysplat.training.joint_optimizer import JointOptimizer
 from asysplat.training.module import block_matrices
-from asysplat.training.muon import Muon
-from asysplat.training.schedule import cosine
+from asysplat.training.optimizers import JointOptimizer, Muon, cosine
 
 
 def make_joint():

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from asysplat.evaluation.static_cost import blank_views
 from asysplat.scene import Cameras, Views
 from asysplat.training import SplattingLoss, SplattingModule
-from asysplat.training.schedule import cosine
+from asysplat.training.optimizers import cosine
 
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
 FOLDER = Path(__file__).parents[2] / "conf" / "model"

@@ -2,7 +2,7 @@
 
 import torch
 
-from asysplat.training.muon import Muon, orthogonalize
+from asysplat.training.optimizers import Muon, orthogonalize
 
 SHAPES = [(12, 12), (8, 20), (20, 8), (8, 20)]
 

@@ -6,8 +6,8 @@ from test_module import make_module
 from torch import nn
 
 from asysplat.scene import Cameras, Views
-from asysplat.training import SplattingLoss, parallel_scenes
-from asysplat.training.parallel_scenes import ParallelScenes, split
+from asysplat.training import SplattingLoss, parallel
+from asysplat.training.parallel import ParallelScenes, split
 
 SCENES = 3
 
@@ -89,8 +89,8 @@ def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
 def test_any_number_of_workers_gives_the_same_bits(module, threads, monkeypatch):
     batch, found, kinds = make_batch(), [], []
     start = {name: buffer.clone() for name, buffer in module.net.named_buffers()}
-    pool = parallel_scenes._pool
-    monkeypatch.setattr(parallel_scenes, "_pool", lambda *kind: kinds.append(kind) or pool(*kind))
+    pool = parallel._pool
+    monkeypatch.setattr(parallel, "_pool", lambda *kind: kinds.append(kind) or pool(*kind))
     for count in (1, 2, 3):
         threads(count)
         module.net.load_state_dict(start, strict=False)

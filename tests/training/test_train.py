@@ -12,7 +12,6 @@ import pytest
 import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams import metadata
 from tiny_runs import COSTS, finished
 
 
@@ -59,25 +58,12 @@ def events(whole) -> EventAccumulator:
     return EventAccumulator(folder, size_guidance={"histograms": 0}).Reload()
 
 
-def test_tensorboard_shows_training_validation_test_and_steps_first(events):
-    scalars = set(events.Tags()["scalars"])
-    names = ("1_train/psnr", "2_val/psnr", "3_test/procedural/psnr", "4_steps/learning_rate")
-    assert {*names, "cost/parameters", "baseline/procedural/mean_color/psnr"} <= scalars
-    groups = sorted({tag.partition("/")[0] for tag in scalars if "/" in tag})
-    assert groups[:4] == ["1_train", "2_val", "3_test", "4_steps"]
-    assert not any(name.startswith("1_train/") and "bad" in name for name in scalars)
-
-
-def test_the_parts_of_every_measured_step_add_up_to_all_of_it(events):
-    for name in ("time/share_data", "gradient/geometry", "gradient/head", "memory/peak_gb"):
+def test_tensorboard_has_losses_metrics_costs_and_baselines(events):
+    names = ("train/psnr", "val/psnr", "test/procedural/psnr", "train/learning_rate")
+    names += ("cost/parameters", "baseline/procedural/mean_color/psnr")
+    assert {*names} <= set(events.Tags()["scalars"])
+    for name in ("time/views_per_second", "gradient/geometry", "gradient/head", "memory/peak_gb"):
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
-    shares = [tag for tag in events.Tags()["scalars"] if tag.startswith("time/share_")]
-    assert len(shares) == 7
-    for step in range(3):
-        values = {tag: events.Scalars(tag)[step].value for tag in shares}
-        assert sum(values.values()) == pytest.approx(1, abs=1e-5)
-        parts = ("network", "rendering", "loss", "backward", "optimizer")
-        assert all(values[f"time/share_{part}"] > 0 for part in parts)
 
 
 def test_every_validation_has_histograms_of_its_gaussians(events, whole):
@@ -94,13 +80,6 @@ def test_tensorboard_has_the_result_and_images(events, whole):
     last = events.Scalars("hp/psnr")[-1].value
     assert abs(last - metrics(whole)["test/procedural/psnr"]) < 1e-3
     assert any(tag.startswith("val/") for tag in events.Tags()["images"])
-
-
-def test_tensorboard_ticks_the_options_that_studies_vary(events):
-    started = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
-    options = metadata.parse_session_start_info_plugin_data(started).hparams
-    ticked = [name.partition("_")[2] for name in sorted(options)[:5]]
-    assert ticked == ["geometry_ratio", "seed", "learning_rate", "model.layers", "steps"]
 
 
 LEFT_OUT = [
@@ -139,7 +118,6 @@ def test_without_some_callbacks_the_rest_is_there(train, names, tmp_path, monkey
             (checkpoints / "best.ckpt").exists() or "metrics" in names,
         ),
         "progress": ("step 2 of 4" in result.stdout,),
-        "monitor": ("a step took" in result.stdout,),
     }
     for name, there in left.items():
         assert set(there) == {name not in names}, name

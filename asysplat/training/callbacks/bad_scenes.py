@@ -6,7 +6,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 
 from asysplat.errors import InputError
-from asysplat.training.parallel_scenes import Batch
+from asysplat.training.parallel import Batch
 
 
 class BadScenes(Callback):

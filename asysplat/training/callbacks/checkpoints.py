@@ -1,22 +1,47 @@
 """Write a run's checkpoints: the last two, to resume from, and the best."""
 
 import os
+import random
 import signal
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning import LightningModule, Trainer
+from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from asysplat.runs.checkpoints import LAST, PREVIOUS, atomic_save
 from asysplat.runs.revision import revision
-from asysplat.training.random_states import RandomStates, random_states, set_random_states
-from asysplat.training.tensorboard import event_files
+from asysplat.runs.summary import Results
+
+RandomStates = dict[str, Any]  # tensors and plain values: a checkpoint is read with weights_only
+
+
+def random_states() -> RandomStates:
+    """Return the states of Python's, NumPy's and torch's generators, of all GPUs too."""
+    name, keys, *rest = np.random.get_state()
+    return {
+        "python": random.getstate(),
+        "numpy": (name, torch.from_numpy(keys.astype(np.int64)), *rest),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all(),
+    }
+
+
+def set_random_states(states: RandomStates) -> None:
+    """Restore the generators; those of GPUs only if their number is the same."""
+    random.setstate(states["python"])
+    name, keys, *rest = states["numpy"]
+    np.random.set_state((name, keys.numpy().astype(np.uint32), *rest))
+    torch.set_rng_state(states["torch"])
+    if len(states["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(states["cuda"])
+
 
 # A scheduler sends one before it kills: SLURM SIGTERM, submitit SIGUSR2, others SIGUSR1.
 PREEMPTION_SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
@@ -31,8 +56,8 @@ class Checkpoints(ModelCheckpoint):
     checkpoint the signal's earlier handler runs (submitit's, for example), or the run ends with
     status 128 + the signal's number.
 
-    A checkpoint holds, in addition to Lightning's entries, `revision`, `random_states` (a list, one
-    of each process) and `event_files`, see `asysplat.training.tensorboard`.
+    A checkpoint holds, in addition to Lightning's entries, `revision` and `random_states` (a list,
+    one of each process).
 
     Args:
         dirpath: the folder.
@@ -62,7 +87,6 @@ class Checkpoints(ModelCheckpoint):
             torch.distributed.all_gather_object(states, random_states())
         checkpoint["random_states"] = states
         checkpoint["revision"] = revision()
-        checkpoint["event_files"] = event_files(trainer.loggers)
 
     def on_load_checkpoint(
         self, trainer: Trainer, module: LightningModule, checkpoint: dict[str, Any]
@@ -173,3 +197,21 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     ) -> None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         atomic_save(checkpoint, Path(path))
+
+
+class StageRecord(Callback):
+    """Saves the name of the stage and the results of the stages before it in each checkpoint.
+
+    A later stage writes its first checkpoint before its first step, which saves the results of the
+    stage before it.
+    """
+
+    def __init__(self, stage: str, earlier: Results):
+        self.stage, self.earlier = stage, earlier
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"stage": self.stage, "earlier": self.earlier}
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
+        if self.earlier and trainer.global_step == 0:
+            trainer.save_checkpoint(trainer.checkpoint_callback.last)

@@ -11,8 +11,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.training.module import SplattingModule
-from asysplat.training.parallel_scenes import Batch
-from asysplat.training.prediction import Prediction
+from asysplat.training.parallel import Batch, Prediction
 
 IMAGE = ("set", "scene", "view")  # the columns that identify a row
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.scene import Gaussians, Views, inverse_depths
-from asysplat.training.prediction import Prediction
+from asysplat.training.parallel import Prediction
 
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEVIATION = 0.1  # of the median disparity

@@ -11,7 +11,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import ssim
 from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.perceptual import PerceptualDistance, vgg16
-from asysplat.training.prediction import Prediction
+from asysplat.training.parallel import Prediction
 
 
 class SplattingLoss(nn.Module):

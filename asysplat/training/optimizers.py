@@ -1,12 +1,68 @@
-"""Muon: steps matrices along the orthogonal part of their momentum."""
+"""Optimizers and the learning rate of each step."""
 
+import math
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+
+def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaLR:
+    """Return the schedule of a linear warm-up to the optimizer's rate, then a cosine to 0.
+
+    The warm-up is part of the total; both are counted in optimizer steps.
+    """
+
+    def factor(step: int) -> float:
+        if step < warmup_steps:
+            return (step + 1) / warmup_steps
+        progress = (step - warmup_steps) / max(1, total_steps - warmup_steps)
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+    return LambdaLR(optimizer, factor)
+
+
+class JointOptimizer(Optimizer):
+    """Steps optimizers of disjoint parameters as one, whose state and groups are those of all.
+
+    A schedule multiplies the rates of all groups; each group keeps its own rate.
+    """
+
+    def __init__(self, *optimizers: Optimizer):
+        self.optimizers = optimizers
+        super().__init__([group for part in optimizers for group in part.param_groups], {})
+        self._share()
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Step every optimizer, after the closure has computed the gradients."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for part in self.optimizers:
+            part.step()
+        return loss
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load the state and the groups of all optimizers."""
+        super().load_state_dict(state_dict)
+        self._share()
+
+    def _share(self) -> None:
+        """Give every optimizer its groups and the common state, as the same objects."""
+        self.state = defaultdict(dict, self.state)
+        start = 0
+        for part in self.optimizers:
+            count = len(part.param_groups)
+            part.param_groups = self.param_groups[start : start + count]
+            part.state = self.state
+            start += count
+
 
 QUINTIC = (3.4445, -4.7750, 2.0315)  # Jordan's: singular values go to about 0.7 to 1.2
 STEPS = 5

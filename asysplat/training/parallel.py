@@ -1,4 +1,4 @@
-"""Compute the scenes of a batch in parallel on a CPU, each in a thread.
+"""Compute the scenes of a batch in parallel: in threads of a CPU, or by processes.
 
 The operators of a scene of low resolution are too short to be divided among the cores.
 The gradients of the scenes are averaged in the order of the scenes, so that the number of threads
@@ -9,34 +9,42 @@ import copy
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache, reduce
 from typing import Any
 
 import torch
+from lightning.pytorch.strategies import ModelParallelStrategy
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from asysplat.training.step_timer import StepTimer
+from asysplat.rendering import Rendering
+from asysplat.scene import Gaussians
 
 Batch = dict[str, Any]
 Terms = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Gaussians predicted from the input views, and their rendering at the target cameras.
+
+    The Gaussians are those before pruning, which the terms of the loss are of, as in Long-LRM.
+    """
+
+    gaussians: Gaussians
+    rendering: Rendering
 
 
 class ParallelScenes:
     """Computes means over the scenes of a batch, and their gradients.
 
     Batch norms normalize each scene by itself, as if it had its own process; their running means
-    change by the mean over the scenes. `compute` returns terms, "loss" among them; `timer` measures
-    the backward pass of each scene.
+    change by the mean over the scenes. `compute` returns terms, "loss" among them.
     """
 
-    def __init__(
-        self,
-        net: nn.Module,
-        compute: Callable[[Batch, nn.Module], Terms],
-        timer: StepTimer | None = None,
-    ):
-        self.net, self.compute, self.timer = net, compute, timer or StepTimer()
+    def __init__(self, net: nn.Module, compute: Callable[[Batch, nn.Module], Terms]):
+        self.net, self.compute = net, compute
         self.copies: list[nn.Module] = []  # one a scene, with the parameters of `net`
 
     def __call__(self, batch: Batch) -> Terms:
@@ -51,8 +59,7 @@ class ParallelScenes:
             # A cache would be shared by all threads.
             with torch.autocast("cpu", enabled=enabled, dtype=dtype, cache_enabled=False):
                 terms = self.compute(scene, net)
-            with self.timer("backward"):
-                grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
+            grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
             return {name: term.detach() for name, term in terms.items()}, grads
 
         cores = torch.get_num_threads()
@@ -86,6 +93,22 @@ class ParallelScenes:
                 buffer += torch.stack([copied - buffer for copied in changed]).mean(0)
             else:
                 buffer.copy_(changed[0])
+
+
+class ShardedStrategy(ModelParallelStrategy):
+    """Shards weights and batches among all processes of all nodes (FSDP2, also on CPUs).
+
+    `configure_model` of the module shards the weights. A checkpoint is one file with all of them,
+    which a single process can read too.
+    """
+
+    def __init__(self):
+        super().__init__(tensor_parallel_size=1, save_distributed_checkpoint=False)
+
+    def setup_environment(self) -> None:
+        # Lightning's "auto" would shard weights within a node only, by tensor parallelism.
+        self._data_parallel_size = self.num_nodes * self.num_processes
+        super().setup_environment()
 
 
 def split(batch: Batch) -> list[Batch]:
