@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 
 from asysplat.errors import InputError
 from asysplat.files import check_writable
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 from asysplat.terminal import make_console
 from benchmarks.compare import compare, read_old
 from benchmarks.options import describe_machine, find_suite

@@ -27,12 +27,12 @@ from asysplat.data.datamodule import FixedTasks, Sample
 from asysplat.data.photographs import Photographs, normalized_points
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.metrics import write_csv
 from asysplat.evaluation.post_optimization import (
     POST_OPTIMIZATION_METHOD,
     PostOptimization,
     Predict,
 )
-from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.evaluation.view_images import ViewImages, find_images, read_images
 from asysplat.export import write_safetensors
@@ -43,8 +43,8 @@ from asysplat.models.network import Network
 from asysplat.refinement import AnchorScene, ScaffoldSettings, refine, refine_scaffold
 from asysplat.refinement.init import initial_gaussians
 from asysplat.runs.checkpoints import load_weights
-from asysplat.runs.device import find_accelerator
 from asysplat.runs.evaluation_target import find_target
+from asysplat.runs.machine import find_accelerator
 from asysplat.runs.runs import EVALUATION
 from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views

@@ -43,7 +43,7 @@ from asysplat.reconstruct.video import find_views
 from asysplat.refinement import RefinementSettings, ScaffoldSettings, refine, refine_scaffold
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
 from asysplat.terminal import make_console

@@ -20,7 +20,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import check_writable
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 from asysplat.runs.runs import find_run
 from asysplat.training.prepare import (
     PreparedRun,

@@ -6,8 +6,7 @@ gaussians = asysplat.refine(gaussians, photographs.inputs, seconds=10.0)
 asysplat.write_gaussians("scene.ply", photographs.normalization.to_world(gaussians))
 """
 
-from asysplat.later import import_later
-from asysplat.root import __version__
+from asysplat.root import __version__, import_later
 
 LATER = {
     "Cameras": "asysplat.scene",

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 from asysplat.interrupts import handle_signals
 from asysplat.root import ROOT, __version__
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 
 EXTRAS = {
     "viewer": "asysplat view, view=true",

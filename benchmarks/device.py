@@ -29,7 +29,7 @@ from asysplat.kernels.self_check import (
 from asysplat.ops import self_check
 from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.rendering.self_check import render as check_render
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from benchmarks import libraries
 from benchmarks.compare import ERROR, TIME, TrackedMetrics
 from benchmarks.libraries import LIBRARIES

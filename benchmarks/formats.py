@@ -17,7 +17,7 @@ from asysplat.export.gaussians import (
     read_notes,
     write_gaussians,
 )
-from asysplat.export.likeness import COMPARED_VIEWS, picture_psnr
+from asysplat.export.importance import COMPARED_VIEWS, picture_psnr
 from asysplat.export.scene_cameras import cameras_beside
 from asysplat.scene import Gaussians
 from benchmarks.compare import DECIBELS, RATIO, TIME, TrackedMetrics

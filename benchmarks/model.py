@@ -19,10 +19,10 @@ from rich.table import Table
 from asysplat import models, ops
 from asysplat.evaluation.measured_cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.static_cost import count_parameters
+from asysplat.models.layers import Tokenizer
 from asysplat.models.network import Network
-from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from asysplat.scene import Gaussians, Views
 from benchmarks.compare import TIME, TrackedMetrics
 from benchmarks.options import PRECISIONS, check_names

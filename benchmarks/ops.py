@@ -14,7 +14,7 @@ from torch import Tensor
 from asysplat import ops
 from asysplat.errors import InputError
 from asysplat.models.prior.plane_sweep import plane_sweep
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from asysplat.scene import Cameras
 from benchmarks import timing
 from benchmarks.compare import ERROR, TIME, TrackedMetrics

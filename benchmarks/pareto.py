@@ -41,7 +41,7 @@ from asysplat.models.network import Network
 from asysplat.refinement import merge_to_limit, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.rendering import INRIA, render
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from asysplat.scene import Views
 from benchmarks import timing
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, TrackedMetrics

@@ -9,8 +9,8 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
+from asysplat.evaluation.metrics import BASELINES
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import CHOICES, Run, config_hash, data_of, differences, find_runs

@@ -10,8 +10,7 @@ from urllib.parse import quote
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
-from asysplat.evaluation.metrics import METRICS
+from asysplat.evaluation.metrics import BASELINES, METRICS
 from asysplat.export.gaussians import WRITERS
 from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, make_folder

@@ -98,7 +98,7 @@ def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, mo
     options += ("video.path=orbit", f"init={init}")
     finished(command(photographs, *options))
     expected = numbers_of(tmp_path / "run")
-    monkeypatch.setattr("asysplat.runs.device.find_device", find)
+    monkeypatch.setattr("asysplat.runs.machine.find_device", find)
     with pretended_device(monkeypatch):
         finished(command(photographs, *options))
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES

@@ -1,6 +1,6 @@
 """Posed images, synthetic or from files, as batches of training and evaluation tasks."""
 
-from asysplat.later import import_later
+from asysplat.root import import_later
 
 LATER = {
     "Augmentation": "asysplat.data.augment",

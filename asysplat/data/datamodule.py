@@ -19,10 +19,14 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
-from asysplat.data.batches import BatchSplit, split_batch
-from asysplat.data.loader import EpochLoader, batches_done, ignore_first_sigterm
-from asysplat.data.normalize import Normalization, normalize
-from asysplat.data.points import depths_of_points
+from asysplat.data.loader import (
+    BatchSplit,
+    EpochLoader,
+    batches_done,
+    ignore_first_sigterm,
+    split_batch,
+)
+from asysplat.data.normalize import Normalization, depths_of_points, normalize
 from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError

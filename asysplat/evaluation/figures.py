@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from matplotlib.figure import Figure
 
-from asysplat.evaluation.baselines import BASELINES, nearest_view_images
-from asysplat.evaluation.metrics import psnr
+from asysplat.evaluation.metrics import BASELINES, nearest_view_images, psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views, inverse_depths
 

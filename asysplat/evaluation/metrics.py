@@ -1,6 +1,9 @@
-"""Compute image and depth metrics: one number for each view, in fp32."""
+"""Compute image and depth metrics, those of baselines, and means of them."""
 
+import csv
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -8,7 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.files import atomic_write
 from asysplat.kernels.precision import without_autocast
+from asysplat.scene import Cameras, Views
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
 SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side
@@ -132,3 +137,73 @@ def _median_where(mask: Bool[Tensor, "*batch V H W"], values: Depths) -> PerView
 
 def _mean_where(mask: Bool[Tensor, "*batch V H W"], values: Depths) -> PerView:
     return values.where(mask, 0).sum((-2, -1)) / mask.sum((-2, -1))
+
+
+def mean_color_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """Fill every target with one color: the mean color of the inputs of its scene."""
+    return inputs.mean_color()[..., None, :, None, None].expand_as(targets.images)
+
+
+def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """Copy the nearest input view for every target; all images have one size.
+
+    The nearest view minimizes distance / extent + angle / pi: the distance between the camera
+    centers, the extent (the largest distance between two input centers), and the angle between the
+    viewing directions. If all inputs share one center, the angle alone decides.
+    """
+    nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
+    return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
+
+
+BASELINES = {  # name in results: title in tables, and what draws the targets
+    "mean_color": ("mean color", mean_color_images),
+    "nearest_view": ("nearest view, copied", nearest_view_images),
+}
+
+
+def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:
+    extent = _distances(inputs.centers, inputs.centers).amax((-2, -1), keepdim=True)
+    distance = _distances(targets.centers, inputs.centers)
+    cosine = targets.cam_to_world[..., :3, 2] @ inputs.cam_to_world[..., :3, 2].mT
+    angle = cosine.clamp(-1, 1).acos()
+    return distance / extent.where(extent > 0, torch.inf) + angle / torch.pi
+
+
+def _distances(
+    a: Float[Tensor, "*batch A 3"], b: Float[Tensor, "*batch B 3"]
+) -> Float[Tensor, "*batch A B"]:
+    return (a[..., :, None, :] - b[..., None, :, :]).norm(dim=-1)
+
+
+ImageRow = dict[str, str | float | int]
+# Columns that name the image of a row; the others are numbers.
+LABELS = ("set", "scene", "images", "view", "method")
+
+
+def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
+    """Average every numeric column over the images that have it; NaN is left out.
+
+    Args:
+        rows: images of one test set.
+        over: "images": all at once, or "scenes": the images of each scene first, then the scenes.
+    """
+    if over == "scenes":
+        scenes: dict[str | float, list[ImageRow]] = {}
+        for row in rows:
+            scenes.setdefault(row["scene"], []).append(row)
+        rows = [average(images, "images") for images in scenes.values()]
+    columns: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            if name not in LABELS:
+                columns.setdefault(name, []).append(value)
+    return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
+
+
+def write_csv(path: Path, rows: Sequence[ImageRow]) -> None:
+    """Write a CSV file atomically; columns that a row lacks are left empty."""
+    with atomic_write(path) as partial, partial.open("w", newline="") as file:
+        columns = dict.fromkeys(name for row in rows for name in row)
+        writer = csv.DictWriter(file, fieldnames=list(columns))
+        writer.writeheader()
+        writer.writerows(rows)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import CostMeter
+from asysplat.evaluation.metrics import ImageRow
 from asysplat.evaluation.protocol import Protocol
-from asysplat.evaluation.rows import ImageRow
 from asysplat.evaluation.view_images import ViewImages
 from asysplat.refinement import PAPER, AnchorScene, Refinement, RefinementProgress, refine
 from asysplat.rendering import Rendering, render

@@ -9,9 +9,8 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation import metrics
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.lpips import MIN_SIDE, lpips_distance
-from asysplat.evaluation.metrics import Depths, Images, PerView
+from asysplat.evaluation.metrics import BASELINES, Depths, Images, PerView
 from asysplat.scene import Views
 
 BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}

@@ -21,8 +21,8 @@ from asysplat.data.datamodule import Sample
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
+from asysplat.evaluation.metrics import ImageRow, average
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
-from asysplat.evaluation.rows import ImageRow, average
 from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.rendering import Rendering
 from asysplat.terminal import make_console

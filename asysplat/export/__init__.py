@@ -1,6 +1,6 @@
 """Files of Gaussians, camera paths, videos and the viewer."""
 
-from asysplat.later import import_later
+from asysplat.root import import_later
 
 LATER = {
     "Notes": "asysplat.export.gaussians",

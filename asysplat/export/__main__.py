@@ -36,8 +36,7 @@ from asysplat.export.gaussians import (
     suffix_of,
     write_gaussians,
 )
-from asysplat.export.importance import most_important
-from asysplat.export.likeness import picture_psnr
+from asysplat.export.importance import most_important, picture_psnr
 from asysplat.export.page import BLACK, PAGE, write_page
 from asysplat.export.scene_cameras import cameras_beside, names_beside
 from asysplat.interrupts import handle_signals

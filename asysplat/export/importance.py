@@ -1,4 +1,4 @@
-"""How much each Gaussian adds to the pictures of a scene."""
+"""Which Gaussians pictures need most, and how like the pictures of a written file are."""
 
 from dataclasses import replace
 
@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.evaluation.metrics import psnr
+from asysplat.export.gaussians import Notes
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
@@ -42,3 +44,25 @@ def most_important(gaussians: Gaussians, fraction: float, cameras: Cameras | Non
     kept = torch.zeros_like(weights, dtype=torch.bool)
     kept[weights.argsort(descending=True, stable=True)[:count]] = True
     return gaussians.keep(kept)
+
+
+COMPARED_VIEWS = 8
+
+
+@torch.no_grad()
+def picture_psnr(before: Gaussians, after: Gaussians, cameras: Cameras, notes: Notes) -> float:
+    """Compute the mean PSNR of one scene's pictures against another's, at up to 8 cameras."""
+    background = torch.tensor(notes.background) if notes.background else None
+    count = min(COMPARED_VIEWS, cameras.num_views)
+    values = []
+    for view in torch.linspace(0, cameras.num_views - 1, count).round().long().tolist():
+        images = [
+            render(
+                *(scene, cameras.select([view]), background),
+                depth=False,
+                antialiased=notes.antialiased,
+            ).image.clamp(0, 1)
+            for scene in (after, before)
+        ]
+        values.append(psnr(*images).mean().item())
+    return sum(values) / count

@@ -1,4 +1,4 @@
-"""Rigid motions of Gaussians, and similarities fitted to points."""
+"""Rotations and rigid motions."""
 
 from dataclasses import replace
 
@@ -10,6 +10,19 @@ from torch import Tensor
 from asysplat.geometry.spherical_harmonics import sh_rotation
 from asysplat.kernels.precision import to_float64
 from asysplat.scene import Gaussians
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Convert quaternions [..., 4] wxyz of any length to rotations [..., 3, 3]."""
+    # Squares of a tiny or huge quaternion would leave float32's range.
+    quats = quats / quats.detach().abs().amax(-1, keepdim=True)
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:

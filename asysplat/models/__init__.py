@@ -2,17 +2,22 @@
 
 from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention
-from asysplat.models.bilateral import CoarseToFine, FineToCoarse, NoLink
-from asysplat.models.early_exit import EarlyExit
-from asysplat.models.fusion import CoarseTokens, FineTokens, FusedTokens
 from asysplat.models.head import GaussianHead, LongLRMHead, ResidualHead
+from asysplat.models.layers import StageShape, Widths
+from asysplat.models.links import (
+    CoarseToFine,
+    CoarseTokens,
+    FineToCoarse,
+    FineTokens,
+    FusedTokens,
+    NoLink,
+)
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
 from asysplat.models.mvsplat import MVSplat
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, PointsPrior
-from asysplat.models.prune import Prune
-from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.single_branch import SingleBranch, build_single_branch
+from asysplat.models.skips import EarlyExit, Prune
 
 __all__ = [
     "AsySplat",

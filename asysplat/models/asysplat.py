@@ -9,11 +9,9 @@ from torch import Tensor, nn
 from asysplat.errors import InputError
 from asysplat.models.geometry_ratio import solve_widths
 from asysplat.models.head import GaussianHead
-from asysplat.models.layers import Layers
+from asysplat.models.layers import Layers, StageShape, Tokenizer, Widths
 from asysplat.models.network import TokenNetwork
-from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import MAX_LAYERS, Component, Stage, build_component
-from asysplat.models.tokenizer import Tokenizer
 
 APPEARANCE_MLP_RATIO = 4
 

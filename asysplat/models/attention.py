@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
-from asysplat.models.norm import RMSNorm
-from asysplat.models.shapes import StageShape
+from asysplat.models.layers import RMSNorm, StageShape
 from asysplat.ops import grid_attention
 
 MAX_GRID = 64  # each image is padded to a multiple of it, in tokens

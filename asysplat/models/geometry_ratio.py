@@ -7,8 +7,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from asysplat.errors import InputError
+from asysplat.models.layers import Widths
 from asysplat.models.network import Network
-from asysplat.models.shapes import Widths
 
 RATIO_TOLERANCE = 0.015
 TOTAL_TOLERANCE = 0.0095  # any two totals are then within 2 %

@@ -1,12 +1,128 @@
-"""A sequence of layers, optionally with activation checkpointing."""
+"""What blocks are made of: shapes, norms, tokenizers and layers."""
 
-from collections.abc import Collection, Generator
+from collections.abc import Collection, Generator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+
+from asysplat.errors import InputError
+from asysplat.kernels.precision import without_autocast
+from asysplat.models.prior import Prior
+from asysplat.scene import Views
+
+
+@dataclass(frozen=True)
+class StageShape:
+    """The sizes of every block of a network stage.
+
+    Args:
+        width: d_s, or d_f in the appearance branch.
+        head_dim: channels of one attention or Mamba2 head; divides every width.
+        mlp_ratio: r_s, hidden over outer width of the stage's MLPs.
+    """
+
+    width: int
+    head_dim: int
+    mlp_ratio: int
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Every width of a model.
+
+    Args:
+        stages: (d_1, d_2, d_3) of the geometry branch.
+        fine: d_f of the appearance branch.
+        head_dim: channels of one attention or Mamba2 head; divides all others.
+    """
+
+    stages: tuple[int, ...]
+    fine: int
+    head_dim: int
+
+    def scaled(self, factor: float) -> "Widths":
+        """Multiply the widths by `factor`; keep the number of heads, of at least 4 channels."""
+        head_dim = max(4, round(self.head_dim * factor / 4) * 4)
+        stages = tuple(width // self.head_dim * head_dim for width in self.stages)
+        return Widths(stages, self.fine // self.head_dim * head_dim, head_dim)
+
+    def stage_shapes(
+        self, stage_ratios: Sequence[int], **per_stage: Sequence[object]
+    ) -> list[StageShape]:
+        """Return the shape of each stage.
+
+        Args:
+            stage_ratios: MLP ratio of each stage.
+            per_stage: other options with one entry for each stage.
+        """
+        for name, values in {"stage_ratios": stage_ratios, **per_stage}.items():
+            if len(values) != len(self.stages):
+                raise InputError(
+                    f"model.{name} has {len(values)} entries for {len(self.stages)} stages of "
+                    "model.stage_widths: give one for each stage."
+                )
+        return [
+            StageShape(width, self.head_dim, ratio)
+            for width, ratio in zip(self.stages, stage_ratios, strict=True)
+        ]
+
+
+class RMSNorm(nn.RMSNorm):
+    """RMSNorm computed in the type of its weights, fp32, and returned in the input's.
+
+    If weights and inputs differ in type, torch does not use its fused kernel.
+
+    Args:
+        width: size of the last dimension.
+    """
+
+    def __init__(self, width: int):
+        super().__init__(width, eps=1e-6)
+
+    def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        with without_autocast(x):
+            return super().forward(x.to(self.weight.dtype)).to(x.dtype)
+
+
+PIXEL_CHANNELS = 9
+
+
+def pixel_features(views: Views, prior: Prior | None) -> Float[Tensor, "B V H W c"]:
+    """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel."""
+    origins, directions = views.cameras.rays()
+    colors = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
+    features = [colors, torch.linalg.cross(origins, directions), directions]
+    if prior is not None:
+        features.append(prior.features(views.cameras.height, views.cameras.width))
+    return torch.cat(features, dim=-1)
+
+
+class Tokenizer(nn.Module):
+    """Linear embedding of p x p patches, then LayerNorm.
+
+    Args:
+        patch: p_c or p_f, in pixels.
+        width: d_c or d_f.
+        channels: channels of a pixel, PIXEL_CHANNELS plus those of the prior.
+        bias: whether the LayerNorm has one.
+    """
+
+    def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS, bias: bool = True):
+        super().__init__()
+        self.patch = patch
+        self.embed = nn.Linear(channels * patch**2, width, bias=False)
+        self.norm = nn.LayerNorm(width, bias=bias)
+
+    def forward(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
+        patches = rearrange(
+            pixels, "b v (h p) (w q) c -> b v h w (p q c)", p=self.patch, q=self.patch
+        )
+        return self.norm(self.embed(patches))
 
 
 class Layers(nn.ModuleList):

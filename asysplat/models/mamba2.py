@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.models.depthwise import depthwise_conv
-from asysplat.models.norm import RMSNorm
-from asysplat.models.shapes import StageShape
+from asysplat.models.layers import RMSNorm, StageShape
 from asysplat.ops import ssd
 
 CONV_KERNEL = 4

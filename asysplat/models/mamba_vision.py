@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from asysplat.models.attention import MLP
 from asysplat.models.depthwise import depthwise_conv
+from asysplat.models.layers import StageShape
 from asysplat.models.mamba2 import inverse_softplus, log_uniform
-from asysplat.models.shapes import StageShape
 from asysplat.ops import selective_scan
 
 CONV_KERNEL = 3

@@ -12,13 +12,10 @@ from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
 from asysplat.kernels.precision import without_autocast
-from asysplat.models.early_exit import EXACT, EarlyExit
 from asysplat.models.head import GaussianHead
-from asysplat.models.layers import Layers
+from asysplat.models.layers import PIXEL_CHANNELS, Layers, Widths, pixel_features
 from asysplat.models.prior import PRIOR_CHANNELS, Prior
-from asysplat.models.prune import Prune
-from asysplat.models.shapes import Widths
-from asysplat.models.tokenizer import PIXEL_CHANNELS, pixel_features
+from asysplat.models.skips import EXACT, EarlyExit, Prune
 from asysplat.scene import Gaussians, Views
 
 

@@ -9,11 +9,10 @@ from torch import Tensor, nn
 from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
 from asysplat.models.head import GaussianHead
+from asysplat.models.layers import Tokenizer, Widths
 from asysplat.models.network import TokenNetwork
-from asysplat.models.prune import Prune
-from asysplat.models.shapes import Widths
+from asysplat.models.skips import Prune
 from asysplat.models.stage import Component, Stage, build_component
-from asysplat.models.tokenizer import Tokenizer
 
 
 class SingleBranch(TokenNetwork):

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
-from asysplat.models.layers import Layers
-from asysplat.models.shapes import StageShape
+from asysplat.models.layers import Layers, StageShape
 
 MAX_LAYERS = 999  # of a stage; a configuration may come from someone else
 Component = Callable[..., nn.Module]

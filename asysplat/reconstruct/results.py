@@ -19,8 +19,7 @@ from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.metrics import METRICS
-from asysplat.evaluation.rows import average, write_csv
+from asysplat.evaluation.metrics import METRICS, average, write_csv
 from asysplat.export import write_gaussians, write_page, write_video
 from asysplat.export.gaussians import NO_NOTES, WRITERS, Notes
 from asysplat.export.page import PAGE

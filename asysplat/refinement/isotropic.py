@@ -1,7 +1,9 @@
-"""Isotropic Gaussians of a given size and color, and the footprint of a pixel at a point."""
+"""Isotropic Gaussians, footprints of pixels, and random numbers."""
+
+from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.geometry.spherical_harmonics import SH_C0
@@ -42,3 +44,21 @@ def footprints(points: Float[Tensor, "N 3"], cameras: Cameras) -> Float[Tensor, 
         outside = torch.minimum(outside, (points - camera.centers).norm(dim=-1) / focal[view])
     sizes = torch.where(visible.isfinite(), visible, outside)
     return sizes.clamp_min(torch.finfo(points.dtype).tiny)
+
+
+def random_permutation(count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
+    """Sample a permutation on the generator's device."""
+    return torch.randperm(count, generator=generator, device=generator.device)
+
+
+def random_order(count: int, generator: torch.Generator) -> Iterator[int]:
+    """Yield indices in a random order, without end; all are used before one is used again."""
+    while True:
+        yield from random_permutation(count, generator).tolist()
+
+
+def random_normal(
+    rows: int, columns: int, generator: torch.Generator
+) -> Float[Tensor, "rows columns"]:
+    """Sample standard normal numbers on the generator's device."""
+    return torch.randn(rows, columns, generator=generator, device=generator.device)

@@ -20,8 +20,8 @@ from asysplat.ops.image_loss import image_loss
 from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.densification.clone_split import screen_gradients
 from asysplat.refinement.fields import Parameters
+from asysplat.refinement.isotropic import random_order
 from asysplat.refinement.refine import RefinementProgress, read_budget, run_steps
-from asysplat.refinement.sampling import random_order
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Cameras, Gaussians, Views
 

@@ -17,7 +17,7 @@ from omegaconf import MISSING, DictConfig, open_dict
 from asysplat.data.sources import tested_sets
 from asysplat.errors import InputError
 from asysplat.runs.checkpoints import weights_file
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
 from asysplat.runs.summary import read_results

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import SECONDS
-from asysplat.evaluation.metrics import METRICS
+from asysplat.evaluation.metrics import BASELINES, METRICS
 from asysplat.files import atomic_write, read_json
 from asysplat.terminal import make_console, print_table
 

@@ -22,7 +22,7 @@ from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError, brief, input_error_behind
-from asysplat.models.early_exit import EarlyExit
+from asysplat.models.skips import EarlyExit
 from asysplat.runs.checkpoints import (
     check_checkpoint,
     config_diff,
@@ -32,8 +32,7 @@ from asysplat.runs.checkpoints import (
     load_weights,
     read_metadata,
 )
-from asysplat.runs.device import find_accelerator
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import find_accelerator, revision
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import RESULTS, describe_run
 from asysplat.runs.stages import (

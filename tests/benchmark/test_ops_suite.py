@@ -5,7 +5,7 @@ import math
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.runs.device import find_device
+from asysplat.runs.machine import find_device
 from benchmarks.ops import PASSES, SCANS
 from benchmarks.options import CPU, PRECISIONS, check_names
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from asysplat.data.batches import split_batch
+from asysplat.data.loader import split_batch
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 from paper.tables import load_paper

@@ -2,7 +2,7 @@
 
 import pytest
 
-from asysplat.data.batches import split_batch
+from asysplat.data.loader import split_batch
 from asysplat.errors import InputError
 
 

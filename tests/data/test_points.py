@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from asysplat.data.datamodule import SceneDataModule, TrainingTasks, collate, load
-from asysplat.data.points import depths_of_points
+from asysplat.data.normalize import depths_of_points
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Task

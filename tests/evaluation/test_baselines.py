@@ -2,7 +2,7 @@ import math
 
 import torch
 
-from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
+from asysplat.evaluation.metrics import mean_color_images, nearest_view_images
 from asysplat.scene import Cameras, Views
 
 

@@ -8,7 +8,7 @@ from asysplat.errors import InputError
 from asysplat.export import read_ply, write_ply
 from asysplat.export.formats.compressed_ply import write_compressed_ply
 from asysplat.export.formats.packing import morton_order
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.scene import Gaussians
 
 

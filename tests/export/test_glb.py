@@ -12,8 +12,7 @@ from asysplat import render
 from asysplat.errors import InputError
 from asysplat.export import write_ply
 from asysplat.export.formats.glb import read_glb, write_glb
-from asysplat.geometry.motion import transform
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations, transform
 from asysplat.scene import Gaussians
 
 PREFIX = "KHR_gaussian_splatting:"

@@ -3,7 +3,7 @@
 import torch
 
 from asysplat.export.formats.packing import half_turn, join_largest, morton_order, split_largest
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.geometry.spherical_harmonics import sh_colors
 
 

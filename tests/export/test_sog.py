@@ -18,7 +18,7 @@ from asysplat.export import read_ply, write_ply
 from asysplat.export.formats import sog
 from asysplat.export.formats.packing import morton_order
 from asysplat.export.formats.sog import read_sog, write_sog
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.scene import Gaussians
 
 

@@ -6,7 +6,7 @@ from oracles import splat_transform
 from asysplat.errors import InputError
 from asysplat.export import read_ply, read_splat
 from asysplat.export.formats.splat import write_splat
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.geometry.spherical_harmonics import SH_C0, sh_colors
 
 

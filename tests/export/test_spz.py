@@ -13,7 +13,7 @@ from asysplat.errors import InputError
 from asysplat.export import read_ply, write_ply
 from asysplat.export.formats.packing import half_turn, morton_order
 from asysplat.export.formats.spz import encode_spz, read_spz, write_spz
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.scene import Gaussians
 
 VERSIONS = (2, 3, 4)

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from asysplat.evaluation import static_cost
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 from asysplat.runs.runs import describe_run, find_run
 from asysplat.runs.stages import stage_configs
 from paper.compare import check_costs, fits

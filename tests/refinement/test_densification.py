@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.refinement.densification.clone_split import (
     DENSIFY_GRAD_THRESHOLD,

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.runs.device import find_accelerator, find_device
+from asysplat.runs.machine import find_accelerator, find_device
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from asysplat.runs import revision as revisions
+from asysplat.runs import machine as revisions
 from asysplat.runs.evaluation_target import find_target
 from asysplat.runs.runs import (
     RECONSTRUCTION,

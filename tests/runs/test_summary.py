@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from asysplat.evaluation.rows import average
+from asysplat.evaluation.metrics import average
 from asysplat.runs.summary import print_evaluation, print_summary, write_json
 
 METRICS = {

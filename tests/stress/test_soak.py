@@ -22,8 +22,7 @@ from poison import FILLS, poisoned
 
 from asysplat import Gaussians, Views, load, open_photographs, refine, render
 from asysplat.data import ProceduralScene
-from asysplat.evaluation.baselines import mean_color_images
-from asysplat.evaluation.metrics import psnr
+from asysplat.evaluation.metrics import mean_color_images, psnr
 from asysplat.refinement import RefinementSettings
 from asysplat.refinement.init import initial_gaussians
 

@@ -12,9 +12,8 @@ from hydra.utils import instantiate
 from asysplat import open_photographs, render
 from asysplat.data import FilesSource, SceneOptions
 from asysplat.data.datamodule import collate, load
-from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
-from asysplat.evaluation.metrics import psnr
+from asysplat.evaluation.metrics import mean_color_images, nearest_view_images, psnr
 from asysplat.runs.checkpoints import SHIPPED, load_weights
 
 SCENES = {"fern": (8, 15), "fox": (8, 16, 32), "hololens-000": (8, 16, 32), "mydesk": (8, 16, 32)}

@@ -16,8 +16,13 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, prepare_for_export
-from asysplat.export.formats.packing import in_morton_order, join_largest, split_largest
+from asysplat.export.formats.packing import (
+    TINY,
+    in_morton_order,
+    join_largest,
+    prepare_for_export,
+    split_largest,
+)
 from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians

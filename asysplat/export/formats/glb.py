@@ -17,12 +17,10 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
 from asysplat.export.formats.json_record import JsonRecord, parse_record
-from asysplat.export.formats.packing import half_turn
+from asysplat.export.formats.packing import TINY, half_turn, prepare_for_export, require_file
 from asysplat.files import atomic_write
-from asysplat.geometry.motion import transform
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations, transform
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 

@@ -14,7 +14,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 
 from asysplat.errors import InputError
 from asysplat.export.formats import compressed_ply
-from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.packing import TINY, prepare_for_export, require_file
 from asysplat.export.formats.ply_table import read_elements
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians

@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import prepare_for_export, require_file
+from asysplat.export.formats.packing import prepare_for_export, require_file
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 

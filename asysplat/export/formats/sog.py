@@ -22,9 +22,15 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
 from asysplat.export.formats.json_record import JsonRecord, parse_record
-from asysplat.export.formats.packing import in_morton_order, join_largest, split_largest
+from asysplat.export.formats.packing import (
+    TINY,
+    in_morton_order,
+    join_largest,
+    prepare_for_export,
+    require_file,
+    split_largest,
+)
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 

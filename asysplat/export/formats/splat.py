@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.packing import TINY, prepare_for_export, require_file
 from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians

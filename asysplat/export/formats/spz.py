@@ -20,8 +20,15 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
-from asysplat.export.formats.packing import half_turn, in_morton_order, join_largest, split_largest
+from asysplat.export.formats.packing import (
+    TINY,
+    half_turn,
+    in_morton_order,
+    join_largest,
+    prepare_for_export,
+    require_file,
+    split_largest,
+)
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 

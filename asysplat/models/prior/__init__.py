@@ -5,8 +5,7 @@ and confidence at each pixel; the head corrects its distance and starts from its
 one (`model/prior=none`) the network is the paper's.
 """
 
-from asysplat.models.prior.depth import DepthPrior, PointsPrior
 from asysplat.models.prior.plane_sweep import PlaneSweepPrior
-from asysplat.models.prior.prior import PRIOR_CHANNELS, Prior
+from asysplat.models.prior.prior import PRIOR_CHANNELS, DepthPrior, PointsPrior, Prior
 
 __all__ = ["PRIOR_CHANNELS", "DepthPrior", "PlaneSweepPrior", "PointsPrior", "Prior"]

@@ -27,8 +27,7 @@ from asysplat.kernels.simd.vectors import (
     where,
     zeros,
 )
-from asysplat.ops.adam.corrections import tabulate_corrections
-from asysplat.ops.adam.reference import AdamSettings, Rows
+from asysplat.ops.adam.reference import AdamSettings, Rows, tabulate_corrections
 
 BLOCK = 1024  # rows of a block
 

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
-from asysplat.ops.adam.corrections import tabulate_corrections
-from asysplat.ops.adam.reference import AdamSettings, Rows
+from asysplat.ops.adam.reference import AdamSettings, Rows, tabulate_corrections
 
 TILE = 65536 if INTERPRETED else 1024  # numbers of a program
 

@@ -1,11 +1,17 @@
 """Adam by its formulas in torch, for any device and float type."""
 
+import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int32
+from numpy import ndarray
 from torch import Tensor
+
+ROUNDING = 2.0**-25  # number so small that 1 - ROUNDING is rounded to 1 in float32
 
 
 class Rows(NamedTuple):
@@ -56,3 +62,13 @@ def adam_step_reference(
         corrected_square = square[index] / (1 - settings.beta2**t)
         parameter[index] -= rates * corrected_mean / (corrected_square.sqrt() + settings.eps)
     return int((visible & ~finite).sum())
+
+
+@cache
+def tabulate_corrections(settings: AdamSettings) -> Float[ndarray, "steps 2"]:
+    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) up to the step t where both are 1."""
+    slowest = max(settings.beta1, settings.beta2, ROUNDING)
+    t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))
+    t[0] = 1  # unused: a row's first step is 1
+    first, second = 1 - settings.beta1**t, 1 - settings.beta2**t
+    return np.stack((1 / first, 1 / np.sqrt(second)), -1).astype(np.float32)

@@ -1,1 +1,33 @@
-"""Where a refinement adds, moves and removes Gaussians."""
+"""What a refinement calls to add, move and remove Gaussians."""
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from asysplat.scene import Cameras, Gaussians, Views
+
+
+class Densifier:
+    """Keeps the Gaussians as they are; a method of densification overrides what it needs."""
+
+    def regularizer(self, gaussians: Gaussians) -> Tensor | float:
+        """Compute a term that is added to the loss of each view."""
+        return 0.0
+
+    def observe_view(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
+        """Take note of the gradients of the offsets from one view."""
+
+    def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
+        """Take note of a step of the optimizer, or add to it.
+
+        Args:
+            visible: Gaussians that a view of the step shows.
+            factor: factor of the learning rates.
+        """
+
+    def densify(self, views: Views, target: int) -> None:
+        """Prune, add or move Gaussians.
+
+        Args:
+            views: input views.
+            target: number of Gaussians after this round, on an even growth to the limit.
+        """

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from asysplat.geometry.rotations import rotations
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.geometry.motion import rotations
+from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.sampling import random_normal
+from asysplat.refinement.isotropic import random_normal
 from asysplat.scene import Cameras, Views
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images

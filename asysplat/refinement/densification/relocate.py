@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.kernels.precision import to_float64
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.sampling import random_normal
+from asysplat.refinement.isotropic import random_normal
 from asysplat.scene import Gaussians, Views
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale

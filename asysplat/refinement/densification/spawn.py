@@ -7,10 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification import Densifier
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.isotropic import isotropic_gaussians
-from asysplat.refinement.sampling import random_permutation
+from asysplat.refinement.isotropic import isotropic_gaussians, random_permutation
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 

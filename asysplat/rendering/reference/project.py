@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from asysplat.geometry.rotations import rotations
+from asysplat.geometry.motion import rotations
 from asysplat.geometry.spherical_harmonics import sh_colors
 from asysplat.rendering.interface import MAX_MAGNITUDE, Projections, RenderSettings
 from asysplat.scene import Cameras, Gaussians

@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from asysplat.runs.checkpoints import LAST, PREVIOUS, atomic_save
-from asysplat.runs.revision import revision
+from asysplat.runs.machine import revision
 from asysplat.runs.summary import Results
 
 RandomStates = dict[str, Any]  # tensors and plain values: a checkpoint is read with weights_only

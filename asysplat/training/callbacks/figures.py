@@ -7,7 +7,7 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 
 from asysplat.evaluation.figures import comparison_figure, learning_curve
-from asysplat.evaluation.rows import write_csv
+from asysplat.evaluation.metrics import write_csv
 from asysplat.training.loggers import log_figure
 from asysplat.training.parallel import Batch, Prediction
 

@@ -8,8 +8,8 @@ import torch
 from lightning import Callback, Trainer
 
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.metrics import ImageRow, average, write_csv
 from asysplat.evaluation.protocol import Protocol
-from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.training.module import SplattingModule
 from asysplat.training.parallel import Batch, Prediction
 

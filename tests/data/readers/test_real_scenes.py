@@ -5,7 +5,7 @@ import pytest
 
 from asysplat.data import SceneOptions, open_scene
 from asysplat.data.bad_images import BadImages
-from asysplat.data.points import depths_of_points
+from asysplat.data.normalize import depths_of_points
 from asysplat.data.readers import colmap, llff, long_lrm, posed, transforms
 
 SCENES = {"fern": llff, "fox": transforms, "mydesk": long_lrm, "hololens-000": posed}
