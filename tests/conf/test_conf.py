@@ -31,10 +31,10 @@ CHOICES = sorted(CHOICES - PARTS)
 STAGES = ("stage1", "stage2", "stage3", "ablation")
 TRAINED = [choice for choice in CHOICES if choice.startswith(("model=", "experiment=t"))]
 TRAINED += ["stage=stage3", "stage=ablation"]
-# Of models that differ from another in the mix of their layers alone.
-MIX = re.compile(r"model=(asysplat_\d[mt]\d?a?|asysplat_7m1[st]|longlrm_(18|24))$")
+# Models that differ from another in the mix of their layers alone, and what takes long.
+MIX = r"model=(asysplat_\d[mt]\d?a?|asysplat_7m1[st]|longlrm_(18|24))$|experiment=three_stages"
 TRAINED = [
-    pytest.param(choice, marks=[pytest.mark.slow] if MIX.match(choice) else [])
+    pytest.param(choice, marks=[pytest.mark.slow] if re.match(MIX, choice) else [])
     for choice in TRAINED
 ]
 TINY = [*SIZE, *VIEWS, *SCENES, "data.test_sets=null", "data.batch_size=1"]

@@ -4,7 +4,6 @@ import pytest
 import torch
 from oracles import splat_transform
 
-from asysplat.errors import InputError
 from asysplat.export import read_ply, write_ply
 from asysplat.export.formats.compressed_ply import write_compressed_ply
 from asysplat.export.formats.packing import morton_order
@@ -68,34 +67,3 @@ def test_splat_transform_reads_and_writes_the_same_numbers(make_scene, file, tmp
     order = (back.means[:, None] - scene.means).norm(dim=-1).argmin(1)
     assert order.unique().numel() == 700
     assert_near(back, scene.map(lambda field: field[order]))
-
-
-def test_damaged_files_are_refused(make_scene, file):
-    write_compressed_ply(file, make_scene(count=300, dtype=torch.float32)[0])
-    stored = file.read_bytes()
-    for old, new, message in (
-        (b"element chunk 2", b"element chunk 1", "has 1 ranges for 300 Gaussians"),
-        (b"element chunk 2", b"element range 2", "has 0 ranges for 300 Gaussians"),
-        (
-            b"float max_y",
-            b"float may_y",
-            "property max_y of its element chunk as none: expected fl",
-        ),
-        (
-            b"uint packed_scale",
-            b"float packed_scale",
-            "packed_scale .* as float32: expected uint32",
-        ),
-        (b"uint packed_color", b"uint color", "has the property packed_color .* as none"),
-        (b"element sh 300", b"element sh 299", "has 299 rows of 9 properties .* expected 300 rows"),
-        (b"property uchar f_rest_8\n", b"", "has 300 rows of 8 properties"),
-        (b"uchar f_rest_3", b"uchar f_rust_3", "property f_rest_3 of its element sh as none"),
-        (b"vertex 300", b"vertex 3000000000", "is cut off"),
-    ):
-        assert old in stored
-        file.write_bytes(stored.replace(old, new))
-        with pytest.raises(InputError, match=rf"^{file} .*{message}"):
-            read_ply(file)
-    file.write_bytes(stored[:-1])
-    with pytest.raises(InputError, match="is cut off: its header declares 300 rows of sh"):
-        read_ply(file)

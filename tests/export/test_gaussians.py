@@ -47,6 +47,17 @@ def test_every_format_that_is_written_is_read(scene, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", READABLE)
+def test_half_a_file_is_a_sentence_that_names_it(scene, tmp_path, suffix):
+    file = tmp_path / f"scene{suffix}"
+    write_gaussians(file, scene)
+    content = file.read_bytes()
+    for half in (content[: len(content) // 2 + 1], b""):
+        file.write_bytes(half)
+        with pytest.raises(InputError, match=f"scene{suffix}"):
+            read_gaussians(file)
+
+
+@pytest.mark.parametrize("suffix", READABLE)
 def test_notes_are_kept_where_there_is_a_place(scene, tmp_path, suffix):
     notes = Notes((1e7, -2.5, 0.1), (0.25, 0.5, 1.0), antialiased=True)
     file = tmp_path / f"scene{suffix}"

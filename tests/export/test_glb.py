@@ -5,7 +5,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from damage import check_reader, damaged, damaged_json, variants
 from oracles import gltf_errors, splat_transform
 
 from asysplat import render
@@ -251,16 +250,3 @@ def test_what_is_no_binary_gltf_is_refused(tmp_path, content, message):
     (tmp_path / "scene.glb").write_bytes(content)
     with pytest.raises(InputError, match=rf"scene\.glb {message}"):
         read_glb(tmp_path / "scene.glb")
-
-
-def damaged_text(content, random):
-    document, buffer = parse(content)
-    return join(damaged_json(json.dumps(document).encode(), random), buffer)
-
-
-@pytest.mark.parametrize("count", [400, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_damaged_files_are_read_or_refused_in_one_sentence(written, count):
-    _, file = written
-    contents = variants(file.read_bytes(), count, damaged, damaged_text)
-    read, refused = check_reader(read_glb, file.with_name("bad.glb"), contents)
-    assert read and refused and read + refused == count

@@ -1,6 +1,5 @@
+import io
 import json
-import struct
-import warnings
 import zipfile
 from dataclasses import replace
 from io import BytesIO
@@ -8,7 +7,6 @@ from io import BytesIO
 import numpy as np
 import pytest
 import torch
-from damage import read_zip, write_zip
 from oracles import splat_transform
 from PIL import Image
 
@@ -126,6 +124,21 @@ def test_the_palette_is_nearly_the_best(monkeypatch):
     torch.testing.assert_close((codes[indices] - values.double()).abs(), nearest)
 
 
+def read_zip(content: bytes) -> dict[str, bytes]:
+    """Read all members of a zip file."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write_zip(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    """Write a zip file of these members."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, member in members.items():
+            archive.writestr(name, member)
+    return file.getvalue()
+
+
 @pytest.fixture
 def written(make_scene, tmp_path):
     write_sog(tmp_path / "scene.sog", make_scene()[0])
@@ -182,40 +195,6 @@ def test_what_meta_json_may_not_say_is_refused(written, place, key, value, messa
         read_sog(written)
 
 
-def test_damaged_members_are_refused(written):
-    original = written.read_bytes()
-    # A header that declares 16383 x 16383 pixels, which would take a gigabyte.
-    huge = (
-        b"RIFF" + struct.pack("<I4s4sIBI", 34, b"WEBP", b"VP8L", 22, 0x2F, 0x0FFFBFFE) + bytes(17)
-    )
-    for members, message in (
-        ({"quats": None}, r"has no 'quats\.webp' that can be read \(it is absent\)"),
-        ({"quats": b""}, "which cannot be read as WebP"),
-        ({"quats": webp(4, 4, 4)[:-4]}, "which cannot be read as WebP"),
-        ({"quats": webp(4, 4, 4, value=251)}, "has the alpha 251 in rotation 0"),
-        ({"quats": webp(3, 3, 4)}, "has 3 x 3 pixels in 'quats.webp'"),
-        ({"quats": webp(2048, 2048, 4)}, "has 2048 x 2048 pixels in 'quats.webp'"),
-        ({"quats": huge}, "cannot be read as WebP|has 16383 x 16383 pixels"),
-        ({"shN_centroids": webp(1, 256, 3)}, "has an image of SH that is 256 pixels wide: .* 192"),
-        ({"sh0": webp(4, 4, 3)[:20]}, "which cannot be read as WebP"),
-    ):
-        written.write_bytes(original)
-        change(written, **members)
-        with warnings.catch_warnings(), pytest.raises(InputError, match=f"scene.*({message})"):
-            warnings.simplefilter("error")
-            read_sog(written)
-
-
-def test_members_that_unpack_to_more_than_images_are_refused(written):
-    content = read_zip(written.read_bytes()) | {"means_l.webp": bytes(1 << 24)}
-    written.write_bytes(write_zip(content, zipfile.ZIP_DEFLATED))
-    with pytest.raises(InputError, match=r"'means_l\.webp' .* 16777216 bytes is none of images"):
-        read_sog(written)
-    written.write_bytes(write_zip(content, zipfile.ZIP_LZMA))
-    with pytest.raises(InputError, match="neither stored nor deflated"):
-        read_sog(written)
-
-
 def test_deflated_bundles_are_read(written):
     scene = read_sog(written)
     written.write_bytes(write_zip(read_zip(written.read_bytes()), zipfile.ZIP_DEFLATED))
@@ -227,7 +206,6 @@ def test_what_is_no_bundle_is_refused(tmp_path):
         (b"", "cannot be read as a zip file"),
         (b"ply\n", "cannot be read as a zip file"),
         (write_zip({}), r"has no 'meta\.json' that can be read"),
-        (write_zip({"meta.json": b"[" * 100_000}), r"has a meta\.json that is not JSON"),
         (write_zip({"meta.json": b"[]"}), r"has a meta\.json that is no JSON object"),
     ):
         (tmp_path / "scene.sog").write_bytes(content)

@@ -1,6 +1,5 @@
 """SPZ: what comes back, what is refused, and what another program reads."""
 
-import gzip
 import struct
 from dataclasses import replace
 
@@ -86,37 +85,6 @@ def test_means_that_24_bits_cannot_hold_are_refused(make_scene, file):
 
 def changed(content, offset, kind, value):
     return content[:offset] + struct.pack(kind, value) + content[offset + struct.calcsize(kind) :]
-
-
-def test_damaged_files_are_refused(make_scene, file):
-    scene, _ = make_scene(dtype=torch.float32)
-    plain, four = gzip.decompress(encode_spz(scene)), encode_spz(scene, 4)
-    for content, message in (
-        (b"", "is cut off or damaged"),
-        (b"ply\n", "cannot be unpacked .* no SPZ file"),
-        (gzip.compress(plain[:-1]), "is cut off or damaged: 108 bytes were expected where 107"),
-        (gzip.compress(plain)[:-20], "cannot be unpacked"),
-        (gzip.compress(b"PLYS" + plain[4:]), "is not an SPZ file: expected NGSP"),
-        (gzip.compress(changed(plain, 4, "<I", 1)), "has the version 1: expected 2 to 4"),
-        (gzip.compress(changed(plain, 4, "<I", 9)), "has the version 9: expected 2 to 4"),
-        (gzip.compress(changed(plain, 8, "<I", 0)), "has no Gaussians"),
-        (gzip.compress(changed(plain, 8, "<I", 2**32 - 1)), "is cut off or damaged"),
-        (gzip.compress(changed(plain, 12, "B", 5)), "has the SH degree 5: expected 0 to 4"),
-        (
-            gzip.compress(changed(plain, 13, "B", 24)),
-            "has the number of fraction bits 24: expected 0 to 23",
-        ),
-        (four[:20], "is cut off or damaged"),
-        (four[:-1], "is cut off or damaged"),
-        (changed(four, 15, "B", 5), "has 5 streams"),
-        (changed(four, 16, "<I", 3), "has 6 streams, .* begins at 3: expected 6 and 32"),
-        (changed(four, 16, "<I", 2**32 - 1), "is cut off or damaged"),
-        (changed(four, 32, "<Q", 2**64 - 1), "is cut off or damaged"),
-        (changed(four, 128, "<Q", 0), "cannot be unpacked"),
-    ):
-        file.write_bytes(content)
-        with pytest.raises(InputError, match=rf"^{file} {message}"):
-            read_spz(file)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -41,11 +41,11 @@ MAX_STACK = 256  # bytes of a thread: registers spilled to memory
 LARGER_STACKS = {(90, "ssd.head_gradients"): 384, (90, "ssd.pass_states"): 272}
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "capability",
-    [90, pytest.param(80, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.slow)],
+    [80, 90, 100],
 )
 def test_every_launch_compiles_and_fits(capability):
     launches = without_repeats(record_launches(capability), capability)

@@ -37,7 +37,8 @@ CASES = " or ".join(f"test_{name}.py and ({STRESS[name] or 'test'})" for name in
 @pytest.mark.parametrize(
     "paths, cases",
     [
-        pytest.param(KERNELS, f"cuda and not ({LARGE})", id="every kernel"),
+        pytest.param(KERNELS[:1], f"cuda and not ({LARGE})", id="the renderer's"),
+        pytest.param(KERNELS, f"cuda and not ({LARGE})", marks=pytest.mark.slow, id="all"),
         pytest.param(KERNELS, f"cuda and ({LARGE})", marks=pytest.mark.slow, id="large"),
         pytest.param(("stress",), CASES, marks=pytest.mark.slow, id="stress"),
     ],

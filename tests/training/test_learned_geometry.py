@@ -13,7 +13,7 @@ SMALLER += ["data.num_images=48", "data.num_workers=0", "data.batch_size=1", "da
 SMALLER += ["model.layers=1m1s"]
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_depths_improve_from_the_first_steps(composed):
     """With the paper's loss and AdamW it is .83 and, after 120 steps, 1.24 of the untrained one."""
     config = composed(*SMALLER)

@@ -13,7 +13,7 @@ from asysplat.evaluation.metrics import psnr
 STEPS = 250
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
     batch = collate([load(Task(scene, uniform_selection(96, 4, 2)))])

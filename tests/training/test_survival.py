@@ -114,7 +114,7 @@ def test_a_killed_run_ends_with_the_same_bits_and_logs(
     check_same(whole, folder_of(train, "killed"))
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_a_clock_that_jumps_changes_nothing(train, monkeypatch):
     options = [*OPTIONS, "steps=4", "validate_every=2"]
     whole = finished(train("name=whole", *options))
@@ -179,7 +179,7 @@ def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
 
 
 @pytest.mark.parametrize(
-    "killed", [pytest.param("other", marks=pytest.mark.medium), pytest.param("main", marks=SLOW)]
+    "killed", [pytest.param("other", marks=SLOW), pytest.param("main", marks=SLOW)]
 )
 def test_one_of_two_processes_is_killed(train, killed):
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "data.batch_size=2"]

@@ -100,8 +100,9 @@ def _find_model(scene: Path) -> Path | None:
 
 
 def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
+    pose, cam_from_world = np.eye(4), image.cam_from_world()
+    cam_from_world.rotation.normalize()  # as in COLMAP, which keeps what a file has
+    pose[:3] = cam_from_world.matrix()
     return common.invert_pose(common.check_rigid(pose, f"{model}, pose of {image.name}"))
 
 

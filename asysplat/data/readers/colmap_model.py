@@ -1,9 +1,8 @@
-"""Read the files of a COLMAP model, text and binary, and check that they are complete.
+"""Read the files of a COLMAP model, text or binary.
 
 https://colmap.github.io/format.html
 """
 
-import mmap
 import re
 import struct
 import warnings
@@ -15,23 +14,20 @@ import pycolmap
 from asysplat.errors import InputError
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-FILES = ("cameras", "images", "points3D", "rigs", "frames")
-MAX_CAMERA = 24 + 8 * 16  # bytes of a camera in binary, with the parameters of the largest model
 POINT_FIELDS = 8  # fields of a line of points3D.txt before its track
-MAX_LINE = 2**26  # bytes of a line of text: a photograph with two million matches
+# Of an entry of a binary file: where it counts what follows, the type of the count, bytes of each.
+COUNTS = {"points3D.bin": (43, "<Q", 8), "frames.bin": (64, "<I", 16)}
 
 
 def read_model(model: Path) -> pycolmap.Reconstruction:
-    """Read a model; without its tracks, and with a warning, if these contradict its points."""
+    """Read a model; without its tracks, and with a warning, if a text's contradict its points."""
     binary = (model / "cameras.bin").is_file()
-    files = _files(model, ".bin" if binary else ".txt")
-    entries = {file: _entries(file) for file in files} if binary else {}
-    for file in () if binary else files:
-        check_lines(file)
+    for name in COUNTS if binary else ():
+        if (model / name).exists():
+            _check_whole(model / name)
     try:
-        colmap = _read(model, binary)
-    # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
-    except Exception as error:
+        colmap = _read(model)
+    except Exception as error:  # of any kind, from IndexError to MemoryError
         reason = str(error).split("\n")[0]
         if reason == "Camera model does not exist":
             raise InputError(
@@ -40,8 +36,8 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
             ) from error
         try:
             with TemporaryDirectory() as folder:
-                _write_without_tracks(files, Path(folder), entries)
-                colmap = _read(Path(folder), binary)
+                _write_without_tracks(model, Path(folder))
+                colmap = _read(Path(folder))
         except Exception:
             raise InputError(
                 f"{model} is not a complete COLMAP model ({reason}): copy its cameras, images and "
@@ -55,118 +51,45 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
     if binary:
         # COLMAP invents cameras beyond the file's end.
         expected = 8 + sum(24 + 8 * len(camera.params) for camera in colmap.cameras.values())
-        size = (model / "cameras.bin").stat().st_size
-        if size != expected:
-            raise InputError(
-                f"{model / 'cameras.bin'} has {size} bytes and its cameras take {expected}: it is "
-                "cut short or damaged, so copy it again."
-            )
+        if (model / "cameras.bin").stat().st_size != expected:
+            raise InputError(f"{model / 'cameras.bin'} is cut short: copy it again.")
     else:
         _check_count(model / "images.txt", colmap.num_images())
         _check_count(model / "points3D.txt", colmap.num_points3D())
     return colmap
 
 
-def _files(model: Path, suffix: str) -> list[Path]:
-    return [file for name in FILES if (file := model / f"{name}{suffix}").exists()]
-
-
-def check_lines(file: Path) -> None:
-    """Check that a text has no line so long that it is none of COLMAP's, which is read whole."""
-    with file.open("rb") as parts:
-        while part := parts.read(MAX_LINE):
-            if len(part) == MAX_LINE and b"\n" not in part:
-                raise InputError(
-                    f"{file} has a line of over {MAX_LINE:,} bytes: it is damaged, so copy it "
-                    "again."
-                )
-
-
-def _read(model: Path, binary: bool) -> pycolmap.Reconstruction:
-    colmap = pycolmap.Reconstruction()
-    (colmap.read_binary if binary else colmap.read_text)(model)
+def _read(model: Path) -> pycolmap.Reconstruction:
+    colmap = pycolmap.Reconstruction(model)
     [image.name for image in colmap.images.values()]  # raises UnicodeDecodeError
     return colmap
 
 
-def _entries(file: Path) -> list[tuple[int, int]]:
-    """Find the start of each entry of a binary file, and the end of it or of its fixed part.
-
-    The fixed part of an image or a point ends before the count of its matches. COLMAP itself loops
-    for ever in a file cut short.
-    """
-    entries, end = [], 8
-
-    def number(kind: str, at: int) -> int:
-        return struct.unpack_from(kind, stored, at)[0]
-
-    def image(start: int) -> tuple[int, int]:
-        fixed = stored.find(b"\0", start + 64) + 1  # after numbers and the name
-        if fixed == 0:
-            raise ValueError("a name has no end")
-        return fixed, fixed + 8 + 24 * number("<Q", fixed)
-
-    def point(start: int) -> tuple[int, int]:
-        return start + 43, start + 51 + 8 * number("<Q", start + 43)
-
-    def rig(start: int) -> tuple[int, int]:
-        sensors = number("<I", start + 4)
-        end = start + 8 + 8 * (sensors > 0)
-        for _ in range(sensors - 1):
-            end += 9 + 56 * number("<B", end + 8)  # with a pose or without
-        return end, end
-
-    def frame(start: int) -> tuple[int, int]:
-        end = start + 68 + 16 * number("<I", start + 64)
-        return end, end
-
-    kinds = {"images.bin": image, "points3D.bin": point, "rigs.bin": rig, "frames.bin": frame}
-    size = file.stat().st_size
+def _check_whole(file: Path) -> None:
+    """Check that a binary file has all its entries: COLMAP loops for ever in one cut short."""
+    offset, kind, each = COUNTS[file.name]
+    stored, end = file.read_bytes(), 8
     try:
-        # Only what is asked for is read, however large the file.
-        with (
-            file.open("rb") as opened,
-            mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as stored,
-        ):
-            count = number("<Q", 0)
-            kind = kinds.get(file.name)  # none for cameras, whose size follows from their model
-            if 8 * count > size or (kind is None and size > 8 + MAX_CAMERA * count):
-                raise ValueError(f"its header gives {count} entries")
-            if kind:
-                for _ in range(count):
-                    start = end
-                    fixed, end = kind(start)
-                    entries.append((start, fixed))
-                if end != size:
-                    raise ValueError(f"its entries take {end} bytes")
-    except (struct.error, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{file} has {size} bytes, but {error}: it is cut short or damaged, so copy it again."
-        ) from error
-    return entries
+        for _ in range(struct.unpack_from("<Q", stored)[0]):
+            (count,) = struct.unpack_from(kind, stored, end + offset)
+            end += offset + struct.calcsize(kind) + each * count
+    except struct.error:
+        end = -1
+    if end != len(stored):
+        raise InputError(f"{file} is cut short: copy it again.")
 
 
-def _write_without_tracks(
-    files: list[Path], folder: Path, entries: dict[Path, list[tuple[int, int]]]
-) -> None:
-    """Copy the files of a model without the matches of its images and the tracks of its points."""
-    for file in files:
-        if file.name in ("images.bin", "points3D.bin"):
-            stored, empty = file.read_bytes(), bytes(8)
-            parts = [stored[start:end] + empty for start, end in entries[file]]
-            (folder / file.name).write_bytes(stored[:8] + b"".join(parts))
-            continue
-        if file.name in ("images.txt", "points3D.txt"):
-            lines = file.read_bytes().decode("latin-1").split("\n")
-            comments = [line for line in lines if line.startswith("#")]
-            lines = [line for line in lines if not line.startswith("#")]
-            if file.name == "images.txt":  # every second line has matches
-                lines = [line for image in lines[::2] for line in (image, "")]
-            else:
-                lines = [" ".join(line.split()[:POINT_FIELDS]) for line in lines]
-            (folder / file.name).write_bytes("\n".join((*comments, *lines)).encode("latin-1"))
-            continue
-        (folder / file.name).write_bytes(file.read_bytes())
+def _write_without_tracks(model: Path, folder: Path) -> None:
+    """Copy a text model without the matches of its images and the tracks of its points."""
+    for file in model.glob("*.txt"):
+        lines = file.read_text(encoding="utf-8").split("\n")
+        comments = [line for line in lines if line.startswith("#")]
+        lines = [line for line in lines if not line.startswith("#")]
+        if file.name == "images.txt":  # every second line has matches
+            lines = [line for image in lines[::2] for line in (image, "")]
+        elif file.name == "points3D.txt":
+            lines = [" ".join(line.split()[:POINT_FIELDS]) for line in lines]
+        (folder / file.name).write_text("\n".join((*comments, *lines)), encoding="utf-8")
 
 
 def _check_count(file: Path, count: int) -> None:

@@ -28,7 +28,6 @@ import numpy as np
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
-from asysplat.data.readers.colmap_model import check_lines
 from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
@@ -188,7 +187,6 @@ def _points(file: Path) -> Points | None:
     """Read columns 2 to 4 of COLMAP's points3D.txt, https://colmap.github.io/format.html."""
     if not file.is_file():
         return None
-    check_lines(file)
     with file.open(encoding="utf-8", errors="replace") as lines:
         rows = [line.split(maxsplit=4)[1:4] for line in lines if line[:1] not in ("#", "\n")]
     try:

@@ -212,17 +212,6 @@ def nan_pose(scene):
             in_model("images.txt", lambda stored: stored.replace(b"1.png", b"\xff.png")),
             "is not a complete COLMAP model",
         ),
-        "a name of 5,000 digits": (
-            in_model("images.txt", lambda stored: stored.replace(b"1.png", b"1" * 5000 + b".png")),
-            r"(?s)2 of 12 .*1111\.png does not exist",
-        ),
-        "a number of 5,000 digits": (
-            in_model(
-                "images.txt",
-                lambda stored: stored.replace(b"images: 12", b"images: 1" + b"2" * 5000),
-            ),
-            "holds 12 entries and its header gives 12222",
-        ),
         "no points3D": (
             lambda scene: (scene / "sparse/0/points3D.txt").unlink(),
             r"not a complete COLMAP model.*points3D",
@@ -250,23 +239,10 @@ def test_a_model_that_is_cut_short_or_damaged_is_refused(scene, binary, name):
     file = scene / "sparse/0" / f"{name}.{'bin' if binary else 'txt'}"
     stored = file.read_bytes()
     contents = [stored[: int(part * len(stored))] for part in (0.35, 0.7, 0.95)]
-    if binary:
-        contents += [b"", b"\xff" * 500, b"not a model\n" * 40]
     for content in contents:
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"sparse/0.*copy (it|its .* files) again"):
             read(scene)
-
-
-def test_counts_beyond_a_binary_file_are_refused_at_once(scene):
-    model = as_binary(scene) / "sparse/0"
-    for name, start in {"rigs": 12, "frames": 8 + 64, "images": 72 + 6, "points3D": 51}.items():
-        file = model / f"{name}.bin"
-        stored = file.read_bytes()
-        file.write_bytes(stored[:start] + b"\xff\xff\xff\x7f" + stored[start + 4 :])
-        with pytest.raises(InputError, match=f"{name}.bin has {len(stored)} bytes"):
-            read(scene)
-        file.write_bytes(stored)
 
 
 def test_a_model_may_have_no_points(scene):
@@ -318,14 +294,19 @@ def test_points_that_contradict_the_images_are_read_without_their_tracks(scene, 
     np.testing.assert_allclose(cameras_of(posed), expected, atol=1e-12)
 
 
-def test_binary_points_that_track_absent_images_are_read_without_their_tracks(scene):
-    expected = read(scene)
-    file = as_binary(scene, old=True) / "sparse/0/points3D.bin"
-    stored = bytearray(file.read_bytes())
-    for point in range(72):  # 8 bytes of the file, then 59 of each point: its image is at 51
-        stored[59 + 59 * point : 63 + 59 * point] = (99).to_bytes(4, "little")
-    file.write_bytes(stored)
-    with pytest.warns(UserWarning, match="contradict each other"):
-        posed = read(scene)
-        np.testing.assert_allclose(posed.points, expected.points, atol=1e-12)
-    np.testing.assert_allclose(cameras_of(posed), cameras_of(expected), atol=1e-12)
+def test_quaternions_need_not_be_of_unit_length(scene):
+    expected = cameras_of(read(scene))
+    file = scene / "sparse/0/images.txt"
+    lines = file.read_text().split("\n")
+    first = next(n for n, line in enumerate(lines) if line and not line.startswith("#"))
+    for number in range(first, len(lines), 2):
+        fields = lines[number].split()
+        fields[1:5] = (repr(1.04 * float(value)) for value in fields[1:5])
+        lines[number] = " ".join(fields)
+    file.write_text("\n".join(lines))
+    for change in (lambda folder: folder, lambda folder: as_binary(folder, old=True)):
+        poses = cameras_of(read(change(scene)))
+        np.testing.assert_allclose(poses, expected, atol=1e-12)
+        rotations = poses[:, :3, :3]
+        identity = np.broadcast_to(np.eye(3), rotations.shape)
+        np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
