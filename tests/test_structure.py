@@ -21,7 +21,7 @@ BRITISH = (
 )
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
-    ("errors", "interrupts", "later", "root"),
+    ("errors", "interrupts", "root"),
     ("files", "kernels", "overrides", "scene", "terminal"),
     ("cli",),
     ("geometry", "ops"),
