@@ -69,7 +69,7 @@ def reconstruct(config: DictConfig) -> None:
         config = without_scene_files(config, given_options())
     device = find_device(config.device)
     results = Results(Path(config.paths.run), config, per_view)
-    names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
+    names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_error")
     options = {name: config[name] for name in names}
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())

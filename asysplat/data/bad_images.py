@@ -23,7 +23,7 @@ class BadImages:
 
     def __init__(self, policy: Policy = "fail"):
         if policy not in ("fail", "skip"):
-            raise InputError(f"on_bad_image is {policy!r}: expected fail or skip.")
+            raise InputError(f"on_error is {policy!r}: expected fail or skip.")
         self.policy = policy
         self.errors: list[str] = []
 
@@ -60,7 +60,7 @@ class BadImages:
         if bad and self.policy == "fail":
             raise InputError(
                 f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "
-                f"with on_bad_image=skip:{listed}"
+                f"with on_error=skip:{listed}"
             )
         if usable < MIN_IMAGES:
             raise InputError(

@@ -13,7 +13,7 @@ from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task, h
 from asysplat.errors import InputError
 
 SIZE = ("height", "width")
-MODULE_OPTIONS = set(inspect.signature(SceneDataModule).parameters) - {*SIZE, "source"}
+MODULE_OPTIONS = set(inspect.signature(SceneDataModule).parameters) - {*SIZE, "source", "on_error"}
 
 
 def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDataModule:
@@ -95,7 +95,8 @@ def _data_module(
                     f"{', '.join(changeable)}."
                 )
         sets[test_set] = partial(_test_tasks, make_source, **{**main, **changes})
-    return SceneDataModule(source=make_source(**scenes), test_sets=sets, **size, **module)
+    module |= size | {"on_error": options.get("on_error", "fail")}
+    return SceneDataModule(source=make_source(**scenes), test_sets=sets, **module)
 
 
 def _test_tasks(

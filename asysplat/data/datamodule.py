@@ -32,7 +32,7 @@ from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-MAX_DRAWS = 10  # scenes drawn for one task, with on_bad_scene=skip
+MAX_DRAWS = 10  # scenes drawn for one task, with on_error=skip
 MAX_LOADED_BYTES = 2**30  # size of the images that a set of fixed tasks keeps in memory
 
 
@@ -78,8 +78,8 @@ class SceneDataModule(lightning.LightningDataModule):
             data set's name replaces the source's test.
         augmentation: random changes of training tasks; None changes nothing.
         points: whether the inputs have the depths of the scene's sparse points.
-        on_bad_scene: where the files of a training scene cannot be used: "fail", or "skip" to draw
-            another scene. A batch's `bad_scenes` lists the errors.
+        on_error: where the files of a training scene cannot be used: "fail", or "skip" to draw
+            another scene, as its images are left out. A batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its scenes.
         growth_steps: optimizer steps in which the window of the training tasks grows.
 
@@ -102,7 +102,7 @@ class SceneDataModule(lightning.LightningDataModule):
     test_sets: Mapping[str, Callable[[], list[Task]]] = field(default_factory=dict)
     augmentation: Augmentation | None = None
     points: bool = False
-    on_bad_scene: Policy = "fail"
+    on_error: Policy = "fail"
     micro_batch: int | None = None
     growth_steps: int = 0
 
@@ -250,7 +250,7 @@ class TrainingTasks(Dataset):
         self.source, self.seed = data.source, data.seed
         self.augmentation = data.augmentation or Augmentation()
         self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
-        self.draws = MAX_DRAWS if data.on_bad_scene == "skip" else 1
+        self.draws = MAX_DRAWS if data.on_error == "skip" else 1
         self.growing_tasks = data.growth_steps * data.batch_size
 
     def __getitem__(self, index: int) -> Sample:

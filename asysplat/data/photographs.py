@@ -76,14 +76,14 @@ def open_photographs(
     held_out_every: int | None = 8,
     max_held_out: int = 12,
     layout: str = "auto",
-    on_bad_image: Policy = "fail",
+    on_error: Policy = "fail",
     cameras: CameraOptions = GIVEN,
     say: Callable[[str], None] = print,
 ) -> Photographs:
     """Open photographs, select some evenly, and bring them into the network's frame.
 
     Args:
-        path, layout, on_bad_image: see `open_scene`.
+        path, layout, on_error: see `open_scene`.
         height, width: size of the views in pixels; width None keeps the first photograph's aspect
             ratio.
         views, max_held_out: number of input and of held-out views, at most; views None: as many
@@ -104,10 +104,10 @@ def open_photographs(
         4
     """
     _check_counts(height, width, views, held_out_every, max_held_out)
-    if found := find_missing(path, layout, on_bad_image, cameras):
+    if found := find_missing(path, layout, on_error, cameras):
         say(f"cameras: found, see {found}")
         path, layout = found, "auto"
-    scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
+    scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_error)).scene
     if any(scene.origin):
         say(f"the scene is far from the origin: its new origin is {scene.origin} of the files.")
     lens = scene.images[0].lens

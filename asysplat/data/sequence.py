@@ -65,7 +65,7 @@ class SceneOptions:
     Args:
         height, width: size of every view, in pixels.
         layout: a name in `readers.LAYOUTS`, or auto.
-        on_bad_image: "fail" raises one error that names every image that cannot be used; "skip"
+        on_error: "fail" raises one error that names every image that cannot be used; "skip"
             leaves those images out with a warning, and decodes each image once to find them.
         cache: keeps decoded pixels; None keeps none.
         disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
@@ -74,7 +74,7 @@ class SceneOptions:
     height: int
     width: int
     layout: str = "auto"
-    on_bad_image: Policy = "fail"
+    on_error: Policy = "fail"
     cache: ImageCache | None = None
     disparities: Path | str | None = None
 

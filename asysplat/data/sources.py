@@ -176,9 +176,9 @@ class FilesSource:
                 f"data.selection is {self.selection} and data.index is {self.index}: give both "
                 "data.selection=index and data.index=path, or neither."
             )
-        if self.selection == "index" and self.options.on_bad_image == "skip":
+        if self.selection == "index" and self.options.on_error == "skip":
             raise InputError(
-                "data.on_bad_image=skip changes the numbers of the images that data.index names: "
+                "data.on_error=skip changes the numbers of the images that data.index names: "
                 "set it to fail, and fix the images."
             )
 

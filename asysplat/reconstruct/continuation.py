@@ -9,7 +9,7 @@ from asysplat.errors import InputError
 from asysplat.runs.run_config import read_config
 from asysplat.runs.runs import RESULTS, SCENE, find_reconstructions, folder_of
 
-OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_bad_image", "height", "width")
+OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_error", "height", "width")
 OF_PHOTOGRAPHS += ("views", "held_out_every", "max_held_out")
 OF_QUALITY = ("height", "views")  # those that quality= sets
 

@@ -50,7 +50,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         is_whole,
         (
             *("data.num_workers", "training.schedule.warmup_steps"),
-            *("callbacks.figures.scenes", "callbacks.bad_scenes.budget"),
+            "callbacks.figures.scenes",
         ),
     ),
     (f"a whole number from 0 to {SEEDS - 1}", lambda value: is_whole(value, 0, SEEDS), ["seed"]),
@@ -82,7 +82,6 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         lambda value: value is None or (is_number(value) and value >= 0),
         ["callbacks.checkpoints.minutes"],
     ),
-    ("fail or skip", lambda value: value in ("fail", "skip"), ["data.on_bad_scene"]),
     (
         "two whole numbers, such as [64,96], or null for all images",
         lambda value: value is None or is_window(value),

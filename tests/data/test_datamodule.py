@@ -266,7 +266,7 @@ def test_test_sets_are_those_whose_path_and_name_are_set(written):
     root = f"{written}/s3"
     sets = {"here": {"root": root, "selection": "kmeans"}, "nowhere": {"root": None}}
     assert not with_test_sets(sets).test_sets
-    own = {"root": root, "name": "own", "on_bad_image": "fail"} | OPTIONS
+    own = {"root": root, "name": "own", "on_error": "fail"} | OPTIONS
     same = {"own": {"root": "elsewhere"}, "more": {"inputs": 5}}
     with pytest.warns(UserWarning, match=r"their paths are not set: nowhere\. .* paths\.no"):
         data = files_data(test_sets=sets | same, **own)
@@ -326,7 +326,7 @@ def test_another_scene_is_drawn_where_one_cannot_be_read(folders):
         for index in range(20):
             TrainingTasks(files_data(**options))[index]
 
-    tasks = TrainingTasks(files_data(**options, on_bad_scene="skip"))
+    tasks = TrainingTasks(files_data(**options, on_error="skip"))
     samples = [tasks[index] for index in range(20)]
     counts = [len(sample["bad_scenes"]) for sample in samples]
     assert {"s4"}.isdisjoint(sample["scene"] for sample in samples)
@@ -334,7 +334,7 @@ def test_another_scene_is_drawn_where_one_cannot_be_read(folders):
     assert all("train/s4: 24 of 24" in each for sample in samples for each in sample["bad_scenes"])
     batch = collate(samples)
     assert len(batch["bad_scenes"]) == sum(counts)
-    again = files_data(**options, on_bad_scene="skip")
+    again = files_data(**options, on_error="skip")
     for index, sample in enumerate(samples):
         assert torch.equal(TrainingTasks(again)[index]["inputs"].images, sample["inputs"].images)
 
@@ -342,7 +342,7 @@ def test_another_scene_is_drawn_where_one_cannot_be_read(folders):
 def test_training_without_a_scene_that_can_be_read_ends(folders):
     for image in Path(folders["root"]).rglob("images/*"):
         image.unlink()
-    data = files_data(**folders, **OPTIONS, on_bad_scene="skip")
+    data = files_data(**folders, **OPTIONS, on_error="skip")
     with pytest.raises(InputError, match=r"^10 training scenes in a row cannot be used, .*/train/"):
         TrainingTasks(data)[0]
 

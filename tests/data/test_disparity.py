@@ -113,7 +113,7 @@ def test_damaged_images_get_no_map(command, scene, tmp_path):
     assert code == 2 and "1 of 12 images cannot be used" in said and image.name in said
     assert len(list(map_folder(scene, tmp_path / "maps").iterdir())) == FRAMES - 1
     with pytest.warns(UserWarning, match="left out 1 of 12"):
-        assert command(scene, "--on-bad-image", "skip")[0] == 0
+        assert command(scene, "--on-error", "skip")[0] == 0
 
 
 def test_a_map_of_another_image_is_refused(command, scene, tmp_path):

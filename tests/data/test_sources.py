@@ -161,8 +161,8 @@ def test_an_index_that_does_not_fit_the_scenes_is_refused(folder, index):
         drawn(source)
     with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
         FilesSource(root, SIZE, (12, 24), **(options | {"selection": "kmeans"}))
-    with pytest.raises(InputError, match=r"data\.on_bad_image=skip changes the numbers"):
-        FilesSource(root, SceneOptions(8, 8, on_bad_image="skip"), (12, 24), **options)
+    with pytest.raises(InputError, match=r"data\.on_error=skip changes the numbers"):
+        FilesSource(root, SceneOptions(8, 8, on_error="skip"), (12, 24), **options)
 
 
 def test_synthetic_scenes_that_no_list_holds_are_refused():

@@ -32,9 +32,6 @@ REFUSED = {
     "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number",
     "callbacks.non_finite_steps.budget=0": "callbacks.non_finite_steps.budget=0: "
     "give a whole number of at least 1.",
-    "callbacks.bad_scenes.budget=few": "callbacks.bad_scenes.budget=few: "
-    "give a whole number of at least 0.",
-    "data.on_bad_scene=drop": "data.on_bad_scene=drop: give fail or skip.",
     "data.test_size=64": "data.test_size=64: give height and width in pixels, such as [64,96]",
     "data.test_size=[0,64]": "data.test_size=[0, 64]: give height and width in pixels",
     "geometry_ratio=1.5": "geometry_ratio=1.5: give a fraction between 0 and 1",

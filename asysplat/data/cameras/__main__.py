@@ -20,12 +20,12 @@ def main(arguments: list[str] | None = None) -> int:
     help_of_out = "folder of the cameras, outside of that of the photographs"
     parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help=help_of_out)
     parser.add_argument("--frames", type=int, default=100, help="greatest number, of a video")
-    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    parser.add_argument("--on-error", default="fail", choices=("fail", "skip"))
     options = parser.parse_args(arguments)
     try:
         refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
         folder = find_cameras(
-            options.path, options.out, options.frames, options.on_bad_image, make_console()
+            options.path, options.out, options.frames, options.on_error, make_console()
         )
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

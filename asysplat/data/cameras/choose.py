@@ -42,13 +42,13 @@ class CameraOptions:
 
 
 def find_missing(
-    path: Path | str, layout: str, on_bad_image: Policy, options: CameraOptions
+    path: Path | str, layout: str, on_error: Policy, options: CameraOptions
 ) -> Path | None:
     """Return the folder of cameras that are found; None where the given ones are wanted."""
     bare = layout == "auto" and without_cameras(path) is not None
     if not bare and options.choice != "found":
         return None
-    return find_cameras(path, options.where, options.frames, on_bad_image, options.console)
+    return find_cameras(path, options.where, options.frames, on_error, options.console)
 
 
 def refine_given(

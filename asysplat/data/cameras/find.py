@@ -61,7 +61,7 @@ def find_cameras(
     photographs: Path | str,
     where: Path | str,
     frames: int = 100,
-    on_bad_image: Policy = "fail",
+    on_error: Policy = "fail",
     console: Console | None = None,
 ) -> Path:
     """Find the cameras of photographs or of a video; return a folder in COLMAP's layout.
@@ -77,15 +77,15 @@ def find_cameras(
             given cameras are ignored; or a video.
         where: parent of the folder, whose name follows from the photographs.
         frames: greatest number of frames of a video, each the sharpest of an equal part.
-        on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
+        on_error: "fail", or "skip" to leave out photographs that cannot be read.
         console: console that shows the progress; None shows none.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
         raise InputError(f"frames={frames}: give a whole number of at least {LEAST_PHOTOGRAPHS}.")
     video = source.is_file() and source.suffix.lower() in SUFFIXES
-    files = [source] if video else _photographs(source, on_bad_image)
-    lenses = {} if video else _lenses(files, source, on_bad_image)
+    files = [source] if video else _photographs(source, on_error)
+    lenses = {} if video else _lenses(files, source, on_error)
     masks = {file: mask for file in lenses if (mask := find_mask(file)) is not None}
     separate_masks = [mask for file, mask in masks.items() if mask != file]
     folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *separate_masks])}"
@@ -95,7 +95,7 @@ def find_cameras(
         images = work / "images"
         if video:
             save_sharp_frames(source, images, frames, progress)
-            lenses = _lenses(photographs_in(images), source, on_bad_image)
+            lenses = _lenses(photographs_in(images), source, on_error)
         names = colmap_names(lenses)
         for file, name in names.items():
             if not video:
@@ -114,11 +114,11 @@ def find_cameras(
     return folder
 
 
-def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
+def _photographs(source: Path, on_error: Policy) -> list[Path]:
     """List the photographs of a folder, or of a scene that has them elsewhere."""
     if files := photographs_in(source):
         return files
-    images = open_scene(source, SceneOptions(1, 1, on_bad_image=on_bad_image)).scene.images
+    images = open_scene(source, SceneOptions(1, 1, on_error=on_error)).scene.images
     stored = dict.fromkeys(image.file for image in images)
     files = [file for file in stored if isinstance(file, Path)]
     if len(files) < len(stored):
@@ -126,14 +126,14 @@ def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
     return files
 
 
-def _lenses(files: Sequence[Path], source: Path, on_bad_image: Policy) -> dict[Path, tuple]:
+def _lenses(files: Sequence[Path], source: Path, on_error: Policy) -> dict[Path, tuple]:
     """Read what tells the camera of each photograph from others, see `_read_lens`."""
     if len(files) < LEAST_PHOTOGRAPHS:
         raise InputError(
             f"{source} has {len(files)} photographs without camera poses: cameras are found from "
             f"at least {LEAST_PHOTOGRAPHS} that overlap."
         )
-    bad = BadImages(on_bad_image)
+    bad = BadImages(on_error)
     lenses = dict(bad.read_each(lambda file: (file, _read_lens(file)), ((file,) for file in files)))
     bad.report(str(source), len(lenses))
     return lenses

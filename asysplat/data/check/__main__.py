@@ -24,7 +24,7 @@ def read_arguments(words: list[str] | None = None) -> Namespace:
     parser = ArgumentParser(prog="asysplat check", description=__doc__)
     parser.add_argument("path", type=Path, help=f"{EXPECTED}, of which {MAX_SCENES} are checked")
     parser.add_argument("--layout", default="auto", help="of its files; see data/README.md")
-    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    parser.add_argument("--on-error", default="fail", choices=("fail", "skip"))
     help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
     parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
     arguments = parser.parse_args(words)
@@ -69,7 +69,7 @@ def check(options: Namespace, console: Console) -> int:
         console.print(more, highlight=False)
     all_fit = True
     for path in checked:
-        bad = BadImages(options.on_bad_image)
+        bad = BadImages(options.on_error)
         scene = read_scene(layout, path, bad)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the report lists the skipped images

@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
     parser = ArgumentParser(prog="python -m asysplat.data.disparity", description=__doc__)
     parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
     parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
-    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    parser.add_argument("--on-error", default="fail", choices=("fail", "skip"))
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--folder", type=Path, default=CACHE, help="folder of the maps")
     help_of_beside = f"put maps into each scene's own folder, {BESIDE}/"
@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
             folder = scene / BESIDE if options.beside else map_folder(scene, options.folder)
             if options.beside and not scene.is_dir():
                 raise InputError(f"{scene} is not a folder: use --folder in place of --beside.")
-            bad = BadImages(options.on_bad_image)
+            bad = BadImages(options.on_error)
             written, kept = write_maps(layout, scene, folder, estimate, bad)
             print(f"{scene.name}: {written} maps written, {kept} were there: {folder}", flush=True)
     except InputError as error:

@@ -146,12 +146,12 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
         if len(scenes) != 1:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
-    bad = BadImages(options.on_bad_image)
+    bad = BadImages(options.on_error)
     posed = read_scene(layout, path, bad)
     if options.disparities is not None:
         posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)
-    if options.on_bad_image == "skip":
+    if options.on_error == "skip":
         sequence = sequence.without_damaged(bad)
     bad.report(str(path), sequence.num_images)
     return sequence

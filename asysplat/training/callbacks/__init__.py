@@ -1,13 +1,12 @@
 """Callbacks: metrics, costs, figures, bad scenes, non-finite steps, checkpoints, progress."""
 
-from asysplat.training.callbacks.bad_scenes import BadScenes
 from asysplat.training.callbacks.checkpoints import Checkpoints, StageRecord
 from asysplat.training.callbacks.costs import Costs
 from asysplat.training.callbacks.figures import Curve, Figures
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
-from asysplat.training.callbacks.non_finite_steps import NonFiniteSteps
 from asysplat.training.callbacks.progress import show_progress
+from asysplat.training.callbacks.skipped import BadScenes, NonFiniteSteps
 
 __all__ = [
     "BadScenes",

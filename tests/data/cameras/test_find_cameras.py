@@ -240,7 +240,7 @@ def test_a_damaged_photograph(views, tmp_path):
     damaged.write_bytes(damaged.read_bytes()[:1000])
     assert "1 of 6 images cannot be used" in refused(folder, tmp_path)
     with pytest.warns(UserWarning, match="left out 1 of 6 images"):
-        found = find_cameras(folder, tmp_path / "logs", on_bad_image="skip")
+        found = find_cameras(folder, tmp_path / "logs", on_error="skip")
     assert len(read_poses(found / "sparse" / "0")) == 5
 
 

@@ -120,7 +120,7 @@ def test_all_damaged_files_and_a_wrong_depth_unit_are_reported(check, scene):
     assert err.startswith("error: walk: 3 of 12 images cannot be used")
     assert all(name in err for name in ("00003.png", "00007.png", "00009.png"))
     edit(scene, lambda content: content.update(depth_unit_scale_factor=0.01))
-    code, out, err = check(scene, "--on-bad-image", "skip")
+    code, out, err = check(scene, "--on-error", "skip")
     assert code == 0 and out.count("left out") == 3
     assert all(name in out for name in ("00003.png", "00007.png", "00009.png"))
     assert "images          9 " in out and "divide the unit of depth by 9.9" in out

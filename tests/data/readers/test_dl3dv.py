@@ -93,4 +93,4 @@ def test_a_bad_image_is_named_or_left_out(scene, damage, message):
 def test_a_broken_scene_is_refused(scene, damage, message):
     damage(scene)
     with pytest.raises(InputError, match=message):
-        opened(scene, on_bad_image="skip")
+        opened(scene, on_error="skip")

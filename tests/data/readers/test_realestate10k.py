@@ -105,7 +105,7 @@ def test_a_bad_image_is_named_or_left_out(chunk, damage, message):
 )
 def test_a_broken_scene_is_refused(chunk, damage, message):
     with pytest.raises(InputError, match=message):
-        opened(chunk(damage) / KEY, on_bad_image="skip")
+        opened(chunk(damage) / KEY, on_error="skip")
 
 
 def test_a_chunk_that_is_cut_short_or_absent_is_named(chunk):

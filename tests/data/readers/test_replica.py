@@ -93,4 +93,4 @@ def test_a_bad_image_is_named_or_left_out(room, damage, message):
 def test_a_broken_scene_is_refused(room, damage, message):
     damage(room)
     with pytest.raises(InputError, match=message):
-        opened(room, on_bad_image="skip")
+        opened(room, on_error="skip")

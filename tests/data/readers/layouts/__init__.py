@@ -78,7 +78,7 @@ def assert_listed(opened, path, *messages, total=4):
     for sentence, message in zip(sentences, messages, strict=True):
         assert message in sentence
     with pytest.warns(UserWarning) as warnings:
-        sequence = opened(path, on_bad_image="skip")
+        sequence = opened(path, on_error="skip")
     (warning,) = (str(each.message) for each in warnings)
     assert f"left out {bad} of {total} images" in warning
     assert all(message in warning for message in messages)

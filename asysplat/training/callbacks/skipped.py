@@ -1,4 +1,4 @@
-"""Drop, count and report steps with non-finite gradients."""
+"""Count and report what a training skips: non-finite steps, and scenes that cannot be read."""
 
 from typing import Any
 
@@ -67,3 +67,33 @@ class NonFiniteSteps(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         module.log("train/non_finite_steps", float(self.count))
+
+
+class BadScenes(Callback):
+    """Counts the training scenes that could not be read and were replaced by others.
+
+    The end of the training names them; data.on_error=skip goes on without them.
+    """
+
+    def __init__(self):
+        self.count = 0
+        self.errors: list[str] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count, "errors": self.errors}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.count, self.errors = state_dict["count"], list(state_dict["errors"])
+
+    def on_train_batch_end(
+        self, trainer: Trainer, module: LightningModule, _: object, batch: Batch, index: int
+    ) -> None:
+        self.count += len(batch["bad_scenes"])
+        self.errors += [e for e in dict.fromkeys(batch["bad_scenes"]) if e not in self.errors]
+
+    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
+        module.log("train/bad_scenes", float(self.count), sync_dist=True, reduce_fx="sum")
+
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
+        if self.count:
+            print(f"{self.count} training scenes were replaced: {list_names(self.errors)}")
