@@ -4,8 +4,8 @@ python evaluate.py run=last
 """
 
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,16 +23,16 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich.progress import track
 from torch import Tensor, nn
 
-from asysplat.data.datamodule import FixedTasks, Sample
-from asysplat.data.photographs import Photographs, normalized_points
+from asysplat.data.datamodule import FixedTasks, Sample, SceneDataModule
+from asysplat.data.photographs import normalized_points
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import write_csv
 from asysplat.evaluation.post_optimization import (
     POST_OPTIMIZATION_METHOD,
     PostOptimization,
-    Predict,
 )
+from asysplat.evaluation.post_optimization import Predict as PredictScene
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.evaluation.view_images import ViewImages, find_images, read_images
 from asysplat.export import write_safetensors
@@ -50,7 +50,26 @@ from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views
 from asysplat.training.loggers import quiet_lightning
 
-Predictor = Callable[[Sample], Predict]  # prediction function for a sample's scene
+Predict = Callable[[Sample], PredictScene]  # prediction function for a sample's scene
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is measured.
+
+    Args:
+        predict: returns what predicts the scene of a sample from its input views.
+        sets: names of the test sets that it is measured on.
+        facts: what its results depend on, in addition to the target's fingerprint.
+        backgrounds: RGB [3] behind its scenes, by scene; the measure's own for the others.
+        early_exit: fractions that the last prediction has skipped, changed by each.
+    """
+
+    predict: Predict
+    sets: Sequence[str]
+    facts: Mapping[str, float] = field(default_factory=dict)
+    backgrounds: Mapping[str, Tensor] = field(default_factory=dict)
+    early_exit: Mapping[str, float] = field(default_factory=dict)
 
 
 @command("evaluate", "stopped; the same command resumes with the scenes that are missing.")
@@ -60,39 +79,27 @@ def evaluate(options: DictConfig) -> None:
     target = find_target(options, HydraConfig.get().overrides.task)
     config = target.config
     check_writable(target.scene_folder, "paths.logs")
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
     fabric = make_fabric(config)
     measure = make_measure(config, options, fabric.device)
     net = load_network(config, fabric.device) if target.system is None else None
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
-    tests, early_exit, fingerprint = data.tests, {}, target.fingerprint
-    if net is not None:
-        data.check_sizes(net.check_size)
-        data.check_views(net.check_views)
-        predictor, early_exit = make_predictor(net, fabric), net.early_exit_fractions
-    else:
-        tests = {data.name: data.tests[data.name]}
-        described = {"tested/scenes": len(tests[data.name])}
-        if target.system == "gaussians":
-            opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
-            predictor, fitted, backgrounds = opened
-            measure, described = replace(measure, backgrounds=backgrounds), described | fitted
-        elif target.system == "images":
-            predictor = open_images(Path(options.images), tests[data.name], fabric.device)
-        else:
-            predictor = make_refiner(options, measure, tests[data.name])
-        fingerprint = fingerprint | described
-
+    source = open_source(target.system, options, data, measure, net, fabric)
+    measure = replace(measure, backgrounds=source.backgrounds)
+    tests = {name: data.tests[name] for name in source.sets}
     folders = target.folder, target.scene_folder
-    scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)
+    scenes = measure_scenes(
+        tests, source.predict, measure, fabric.device, *folders, source.early_exit
+    )
     if options.write_gaussians is not None:
-        write_predictions(Path(options.write_gaussians), tests[data.name], predictor, fabric.device)
+        folder = Path(options.write_gaussians)
+        write_predictions(folder, tests[data.name], source.predict, fabric.device)
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
-    results = fingerprint | {"evaluation/post_optimization": POST_OPTIMIZATION_METHOD}
+    results = {**target.fingerprint, **source.facts}
+    results["evaluation/post_optimization"] = POST_OPTIMIZATION_METHOD
     results |= {f"protocol/{k}": v for k, v in measure.protocol.describe().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
     if target.system in ("gaussians", "images"):  # reading a file is no prediction
@@ -101,6 +108,31 @@ def evaluate(options: DictConfig) -> None:
     write_csv(target.folder / "evaluation.csv", image_rows(scenes))
     write_json(target.folder / EVALUATION, results)
     print_evaluation(results, list(scenes), target.folder)
+
+
+def open_source(
+    system: str | None,
+    options: DictConfig,
+    data: SceneDataModule,
+    measure: PostOptimization,
+    net: Network | None,
+    fabric: lightning.Fabric,
+) -> Source:
+    """Open what is measured: the network, or the scenes of another system."""
+    if net is not None:
+        data.check_sizes(net.check_size)
+        data.check_views(net.check_views)
+        predict = network_prediction(net, fabric)
+        return Source(predict, list(data.tests), early_exit=net.early_exit_fractions)
+    tests = data.tests[data.name]
+    if system == "gaussians":
+        source = open_gaussians(Path(options.gaussians), tests, fabric.device)
+    elif system == "images":
+        source = Source(open_images(Path(options.images), tests, fabric.device), ())
+    else:
+        source = Source(make_refiner(options, measure, tests), ())
+    facts = {"tested/scenes": len(tests), **source.facts}
+    return replace(source, sets=[data.name], facts=facts)
 
 
 def make_fabric(config: DictConfig) -> lightning.Fabric:
@@ -137,6 +169,7 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 
 def load_network(config: DictConfig, device: torch.device) -> Network:
     """Load a model, with its early exit."""
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
     net = instantiate(config.model)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(device).eval()
@@ -145,7 +178,7 @@ def load_network(config: DictConfig, device: torch.device) -> Network:
     return net
 
 
-def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
+def network_prediction(net: Network, fabric: lightning.Fabric) -> Predict:
     """Return a network's prediction of a scene, in the precision of the run."""
 
     def predict(prune: bool, inputs: Views) -> Gaussians:
@@ -156,15 +189,10 @@ def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
     return lambda sample: partial(predict, sample["prune"])
 
 
-def open_gaussians(
-    path: Path, tests: FixedTasks, device: torch.device
-) -> tuple[Predictor, dict[str, float], dict[str, Tensor]]:
-    """Read and check the Gaussians of every scene of the data; return what reads one again.
+def open_gaussians(path: Path, tests: FixedTasks, device: torch.device) -> Source:
+    """Read and check the Gaussians of every scene of the data, with the backgrounds of the files.
 
-    Returns:
-        The scene's Gaussians in the frame of its sample, as a prediction; if cameras were fitted,
-        tested/residual, the largest (see `SceneFile.read`); the backgrounds [3] that the files
-        name, by scene.
+    The fact tested/residual is the largest of cameras that were fitted (see `SceneFile.read`).
     """
     files = find_files(path, [task.sequence for task in tests.tasks])
 
@@ -179,21 +207,21 @@ def open_gaussians(
         cameras = sample["targets"].cameras.to(device)
         check_visible(gaussians, cameras, files[sample["scene"]], residual is not None)
         residuals += [] if residual is None else [residual]
-    described = {}
+    facts = {}
     if residuals:
-        described["tested/residual"] = max(residuals)
+        facts["tested/residual"] = max(residuals)
         print(f"{len(residuals)} scenes fitted by cameras, residual {max(residuals):.2%} at most")
 
-    def predictor(sample: Sample) -> Predict:
+    def predict(sample: Sample) -> PredictScene:
         gaussians = read(sample)[0]
         return lambda inputs: gaussians
 
     colors = {name: read_notes(file.path).background for name, file in files.items()}
     known = {name: torch.tensor(color, device=device) for name, color in colors.items() if color}
-    return predictor, described, known
+    return Source(predict, (), facts, known)
 
 
-def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predictor:
+def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predict:
     """Read and check the images of every scene's test views; return what reads a scene's again."""
     paths = find_images(folder, tests.tasks)
 
@@ -204,14 +232,14 @@ def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predic
     for index in track(range(len(tests)), "checking scenes"):
         read(tests[index])
 
-    def predictor(sample: Sample) -> Predict:
+    def predict(sample: Sample) -> PredictScene:
         images = ViewImages(read(sample).images.to(device))
         return lambda inputs: images
 
-    return predictor
+    return predict
 
 
-def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTasks) -> Predictor:
+def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTasks) -> Predict:
     """Return what refines a scene on its input views, from its sparse points or a plane sweep."""
     settings = instantiate(options.refinement)
     function = refine_scaffold if isinstance(settings, ScaffoldSettings) else refine
@@ -221,46 +249,30 @@ def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTas
         limit = {"steps": options.refinement_steps}
     sequences = {task.sequence.name: task.sequence for task in tests.tasks}
 
-    def predictor(sample: Sample) -> Predict:
-        # Synthetic scenes have no sparse points.
-        points = getattr(sequences[sample["scene"]], "points", None)
+    def predict(sample: Sample) -> PredictScene:
+        points = getattr(sequences[sample["scene"]], "points", None)  # of files alone
         points = normalized_points(points, sample["frame"])
 
-        def predict(inputs: Views) -> Gaussians | AnchorScene:
-            device = inputs.images.device
-            photographs = Photographs(
-                sample["scene"],
-                inputs,
-                held_out=None,
-                input_files=[],
-                held_out_files=[],
-                normalization=sample["frame"],
-                points=None if points is None else points.to(device),
-            )
-            init = "plane_sweep" if points is None else "points"
-            start = initial_gaussians(init, photographs, settings)
-            return function(
-                start,
-                inputs,
-                settings,
-                background=measure.background,
-                seed=options.seed,
-                **limit,
-            )
+        def refined(inputs: Views) -> Gaussians | AnchorScene:
+            known = None if points is None else points.to(inputs.images.device)
+            init = "plane_sweep" if known is None else "points"
+            start = initial_gaussians(init, inputs, settings, known)
+            options_of_all = {"background": measure.background, "seed": options.seed}
+            return function(start, inputs, settings, **options_of_all, **limit)
 
-        return predict
+        return refined
 
-    return predictor
+    return predict
 
 
 def write_predictions(
-    folder: Path, tests: FixedTasks, predictor: Predictor, device: torch.device
+    folder: Path, tests: FixedTasks, predict: Predict, device: torch.device
 ) -> None:
     """Write the Gaussians of every test scene, in the data's world, as <scene>.safetensors."""
     make_folder(folder, "write_gaussians")
     for index in track(range(len(tests)), "writing scenes"):
         sample, sequence = tests[index], tests.tasks[index].sequence
-        gaussians = predictor(sample)(sample["inputs"].to(device)).to(torch.float64)
+        gaussians = predict(sample)(sample["inputs"].to(device)).to(torch.float64)
         path, offset = folder / f"{sample['scene']}.safetensors", world_origin(sequence)
         metadata = {"offset": " ".join(map(repr, offset))}
         # In float64, which comes back from the world to the very same float32.

@@ -182,7 +182,9 @@ def initialize(
         gaussians = read_gaussians(init, photographs.origin).to(device)
         gaussians = photographs.normalization.to_network(gaussians)
     else:
-        gaussians = initial_gaussians(init, photographs, settings, network)
+        gaussians = initial_gaussians(
+            init, photographs.inputs, settings, photographs.points, network
+        )
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     if network is not None and network.early_exit_fractions:
         fractions = network.early_exit_fractions.items()

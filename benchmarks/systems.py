@@ -148,7 +148,7 @@ def measure_refinement(
     start = curve.start or ("plane_sweep" if photographs.points is None else "points")
     network = load("shipped") if start == "network" else None
     clock = time.perf_counter()
-    gaussians = initial_gaussians(start, photographs, settings, network)
+    gaussians = initial_gaussians(start, photographs.inputs, settings, photographs.points, network)
     before = time.perf_counter() - clock
     background, rows, due = inputs.mean_color(), [], list(marks)
 

@@ -6,7 +6,6 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from asysplat.data.photographs import Photographs
 from asysplat.data.selection.views import evenly_spaced
 from asysplat.errors import InputError
 from asysplat.models.network import Network
@@ -29,28 +28,29 @@ POINT_OPACITY = 0.1
 @torch.no_grad()
 def initial_gaussians(
     init: str,
-    photographs: Photographs,
+    inputs: Views,
     settings: RefinementSettings | ScaffoldSettings,
+    points: Float[Tensor, "P 3"] | None = None,
     network: Network | None = None,
 ) -> Gaussians:
-    """Build the Gaussians that a refinement with `settings` starts from, in the network's frame.
+    """Build the Gaussians that a refinement with `settings` starts from, in the frame of `inputs`.
 
     Of many views, those of DEPTH_VIEWS, evenly selected. Gaussians of several views on the same
     surface are merged, in cells of a pixel of the network's input or of the prior's depth map, or
     larger ones: `settings.initial_limit`.
     """
-    inputs, pixels = photographs.inputs, 1.0
+    pixels = 1.0
     views = inputs.select(
         evenly_spaced(range(inputs.num_views), min(DEPTH_VIEWS, inputs.num_views))
     )
     longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
-        if photographs.points is None:
+        if points is None:
             raise InputError(
-                f"init=points: {photographs.name} has no sparse points; choose plane_sweep, or a "
-                "layout with points (COLMAP)."
+                "init=points: the scene has no sparse points; choose plane_sweep, or a layout with "
+                "points (COLMAP)."
             )
-        gaussians = gaussians_from_points(photographs.points, inputs)
+        gaussians = gaussians_from_points(points, inputs)
     elif init == "network":
         if network is None:
             raise InputError("init=network needs a network: give one, or choose plane_sweep.")
@@ -59,9 +59,7 @@ def initial_gaussians(
         pixels = longest / max(small.cameras.height, small.cameras.width)
     elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:
-            raise InputError(
-                f"init=depth: {photographs.name} has no depth maps; choose plane_sweep or points."
-            )
+            raise InputError("init=depth: there are no depth maps; choose plane_sweep or points.")
         # Depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views.
         stride = -(-longest // PRIOR_MAX_SIDE)
         small = _shrink(views, longest, stride)

@@ -65,7 +65,7 @@ def test_a_refinement_is_measured_as_it_is_after_its_last_step(photographs):
     curve, seen = RefinedSystem("plane_sweep", CURVES["3DGS"].settings, cut=True), []
     rows = measure_refinement(photographs, curve, [0.05], lambda image: seen.append(image) or {})
     steps = rows[-1]["steps"]
-    gaussians = initial_gaussians("plane_sweep", photographs, curve.settings)
+    gaussians = initial_gaussians("plane_sweep", photographs.inputs, curve.settings)
     color = photographs.inputs.mean_color()
     stop = lambda progress, _: progress.step == steps  # noqa: E731
     refined = refine(

@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.data.normalize import Normalization
-from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.models.prior import Prior
@@ -292,13 +290,11 @@ def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
     ("init", "message"),
     [
         ("swep", "init=swep: choose network, plane_sweep, points, depth, or a"),
-        ("points", "init=points: scene has no sparse points; choose plane_sweep"),
-        ("depth", "init=depth: scene has no depth maps; choose plane_sweep or points"),
+        ("points", "init=points: the scene has no sparse points; choose plane_sweep"),
+        ("depth", "init=depth: there are no depth maps; choose plane_sweep or points"),
         ("network", "init=network needs a network: give one"),
     ],
 )
 def test_a_start_from_what_is_lacking_is_refused(init, message):
-    views, frame = front_views(), Normalization(torch.eye(4, dtype=torch.float64), 1.0)
-    photographs = Photographs("scene", views, None, ["a.png"], [], frame, None)
     with pytest.raises(InputError, match=message):
-        initial_gaussians(init, photographs, RefinementSettings())
+        initial_gaussians(init, front_views(), RefinementSettings())

@@ -109,7 +109,7 @@ elif __name__ == "__main__":
     with poisoned(FILLS[0] if checked else None):
         photographs = open_photographs(scene, SIDE, SIDE, held_out_every=None)
         views = photographs.inputs
-        start = initial_gaussians("plane_sweep", photographs, RefinementSettings())
+        start = initial_gaussians("plane_sweep", photographs.inputs, RefinementSettings())
         end = refine_and_draw(views, start, steps)
         images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
     flat = mean_color_images(views, views)
