@@ -7,6 +7,7 @@ import runpy
 import signal
 import subprocess
 import sys
+import time
 import warnings
 from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
@@ -28,6 +29,9 @@ if INTERPRETED:
     import interpreter  # noqa: F401
 
 REPO = Path(__file__).resolve().parents[1]
+BUDGET = 600  # seconds of make test alone on two cores
+SHARE = 0.1  # of the budget, above which a file is named
+STARTED = time.monotonic()
 pytest_plugins = ["tiny_runs"]
 
 
@@ -180,3 +184,19 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print the seconds of each folder of tests and, last, those of all beside the budget."""
+    seconds: dict[str, Counter] = {"folder": Counter(), "file": Counter()}
+    for report in (r for reports in terminalreporter.stats.values() for r in reports):
+        file = Path(getattr(report, "nodeid", "").partition("::")[0])
+        seconds["file"][file.name] += getattr(report, "duration", 0)
+        seconds["folder"][file.parent.name] += getattr(report, "duration", 0)
+    if (took := time.monotonic() - STARTED) < BUDGET / 10:
+        return
+    listed = [f"{name} {spent:.0f}" for name, spent in seconds["folder"].most_common()]
+    terminalreporter.write_line(f"seconds: {', '.join(listed)}")
+    large = [f"{name} {t:.0f} s" for name, t in seconds["file"].items() if t > SHARE * BUDGET]
+    line = f"{took:.0f} s of a budget of {BUDGET} s; more than {SHARE:.0%} of it take: "
+    terminalreporter.write_line(line + (", ".join(large) or "none"))

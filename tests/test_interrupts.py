@@ -98,7 +98,7 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_sigterm_ends_a_command_quietly(repository, command):
     module, name = COMMANDS[command].split(":")
-    words = [] if command.startswith("examples") else ["scene"]
+    words = [] if command.startswith("examples") else ["."]
     script = f"""
         import runpy, signal, sys
         import {module} as module

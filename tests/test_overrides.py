@@ -6,7 +6,9 @@ import subprocess
 import sys
 
 import pytest
+from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from asysplat import overrides
@@ -124,9 +126,12 @@ def printed_commands(repository) -> list[tuple[str, str]]:
 
 
 @pytest.mark.medium
-def test_every_printed_command_names_what_is_there(repository):
+def test_every_printed_command_names_what_is_there(repository, request):
     printed = printed_commands(repository)
     assert printed
+    GlobalHydra.instance().clear()
+    request.addfinalizer(GlobalHydra.instance().clear)
+    initialize_config_dir(str(CONF), version_base="1.3")  # once for all
     for script, given in printed:
         words = shlex.split(given)
         if script == "reconstruct":  # its photographs, and switches

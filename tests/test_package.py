@@ -97,14 +97,3 @@ def test_the_doctor_names_versions_and_what_is_missing(run):
     lines = dict(line.split(maxsplit=1) for line in run("asysplat", "doctor").splitlines())
     assert lines["torch"].startswith(version("torch")) and lines["asysplat"].endswith("installed")
     assert lines["viewer"] == "asysplat view, view=true"
-
-
-def test_words_are_completed(run, monkeypatch):
-    for line, words in {
-        "asysplat re": "reconstruct report",
-        "asysplat train model=asysplat_4m4s_": "model=asysplat_4m4s_noconv",
-    }.items():
-        monkeypatch.setitem(ENVIRONMENT, "COMP_LINE", line)
-        assert run("asysplat", "-sc", "query=bash").split() == words.split()
-    monkeypatch.delitem(ENVIRONMENT, "COMP_LINE")
-    assert run("asysplat", "-sc", "install=bash").splitlines()[-1].endswith(" asysplat")

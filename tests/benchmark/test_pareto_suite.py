@@ -219,7 +219,7 @@ MISTAKES = [
     (variant("feed_forward", overrides=["model.layers=8m"]), "not fit this model"),
     (
         variant("feed_forward", overrides=["model.layer=8m"]),
-        r"^model\.layer is unknown: did you mean",
+        r"^Could not override .model\.layer.: did you mean",
     ),
     (variant("refined", views=0), r"refined\.a: views=0: give a whole number from 1\."),
     (
