@@ -54,7 +54,7 @@ Predict = Callable[[Sample], PredictScene]  # prediction function for a sample's
 
 
 @dataclass(frozen=True)
-class Source:
+class PredictionSource:
     """What is measured.
 
     Args:
@@ -117,20 +117,20 @@ def open_source(
     measure: PostOptimization,
     net: Network | None,
     fabric: lightning.Fabric,
-) -> Source:
+) -> PredictionSource:
     """Open what is measured: the network, or the scenes of another system."""
     if net is not None:
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
         predict = network_prediction(net, fabric)
-        return Source(predict, list(data.tests), early_exit=net.early_exit_fractions)
+        return PredictionSource(predict, list(data.tests), early_exit=net.early_exit_fractions)
     tests = data.tests[data.name]
     if system == "gaussians":
         source = open_gaussians(Path(options.gaussians), tests, fabric.device)
     elif system == "images":
-        source = Source(open_images(Path(options.images), tests, fabric.device), ())
+        source = PredictionSource(open_images(Path(options.images), tests, fabric.device), ())
     else:
-        source = Source(make_refiner(options, measure, tests), ())
+        source = PredictionSource(make_refiner(options, measure, tests), ())
     facts = {"tested/scenes": len(tests), **source.facts}
     return replace(source, sets=[data.name], facts=facts)
 
@@ -189,7 +189,7 @@ def network_prediction(net: Network, fabric: lightning.Fabric) -> Predict:
     return lambda sample: partial(predict, sample["prune"])
 
 
-def open_gaussians(path: Path, tests: FixedTasks, device: torch.device) -> Source:
+def open_gaussians(path: Path, tests: FixedTasks, device: torch.device) -> PredictionSource:
     """Read and check the Gaussians of every scene of the data, with the backgrounds of the files.
 
     The fact tested/residual is the largest of cameras that were fitted (see `SceneFile.read`).
@@ -218,7 +218,7 @@ def open_gaussians(path: Path, tests: FixedTasks, device: torch.device) -> Sourc
 
     colors = {name: read_notes(file.path).background for name, file in files.items()}
     known = {name: torch.tensor(color, device=device) for name, color in colors.items() if color}
-    return Source(predict, (), facts, known)
+    return PredictionSource(predict, (), facts, known)
 
 
 def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predict:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from asysplat.data.sequence import Points
 from asysplat.geometry.motion import transform
-from asysplat.kernels.precision import to_float64
+from asysplat.kernels.dispatch import to_float64
 from asysplat.scene import Cameras, Gaussians, TensorRecord, Views
 
 

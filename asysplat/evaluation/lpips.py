@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.evaluation.backbones import find_backbone
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 
 MIN_SIDE = 32  # pixels
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 from asysplat.scene import Cameras, Views
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity

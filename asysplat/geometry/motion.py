@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from asysplat.geometry.spherical_harmonics import sh_rotation
-from asysplat.kernels.precision import to_float64
+from asysplat.kernels.dispatch import to_float64
 from asysplat.scene import Gaussians
 
 

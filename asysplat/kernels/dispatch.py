@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -13,6 +14,24 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.kernels.self_check import are_kernels_right
+
+
+def without_autocast(tensor: Tensor) -> AbstractContextManager:
+    """Return a context without autocast on the tensor's device; the meta device has no autocast."""
+    if tensor.device.type == "meta":
+        return nullcontext()
+    return torch.autocast(tensor.device.type, enabled=False)
+
+
+def to_float64(tensor: Tensor) -> Tensor:
+    """Convert a tensor to float64."""
+    if tensor.device.type == "mps":
+        raise InputError(
+            "Apple's GPU (mps) has no float64, which cameras and lengths need: move everything to "
+            "the CPU with .to('cpu')."
+        )
+    return tensor.double()
+
 
 Implementation = TypeVar("Implementation")
 # A forked process lacks the OpenMP threads of its parent, for which torch would wait forever.

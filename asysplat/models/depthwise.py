@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 
 
 def depthwise_conv(

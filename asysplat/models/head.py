@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.geometry.spherical_harmonics import SH_C0
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.prior import Prior
 from asysplat.scene import Gaussians, Views
 

@@ -11,7 +11,7 @@ from einops import rearrange
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.network import Network
 from asysplat.models.single_branch import refuse_ratio
 from asysplat.scene import Cameras, Gaussians, Views

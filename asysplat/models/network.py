@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import PIXEL_CHANNELS, Layers, Widths, pixel_features
 from asysplat.models.prior import PRIOR_CHANNELS, Prior

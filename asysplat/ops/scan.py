@@ -29,8 +29,8 @@ from asysplat.kernels.dispatch import (
     choose_fastest,
     load_kernels,
     look_up_backend,
+    without_autocast,
 )
-from asysplat.kernels.precision import without_autocast
 
 AXIS_NAMES = {"P": "head_dim", "N": "state size"}  # names in messages
 CountFlops = Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]]

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.kernels.precision import to_float64
+from asysplat.kernels.dispatch import to_float64
 from asysplat.refinement.isotropic import footprints
 from asysplat.scene import Cameras, Gaussians
 

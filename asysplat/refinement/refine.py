@@ -19,12 +19,18 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import check_device
 from asysplat.ops.image_loss import image_loss
-from asysplat.refinement.corrections import Corrections, correct_exposure, correct_poses
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
 from asysplat.refinement.densification.relocate import McmcDensifier
 from asysplat.refinement.densification.spawn import ErrorDensifier
-from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
+from asysplat.refinement.fields import (
+    MAX_SH_DEGREE,
+    Corrections,
+    Fields,
+    Parameters,
+    correct_exposure,
+    correct_poses,
+)
 from asysplat.refinement.isotropic import footprints, random_order
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import render

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 from asysplat.rendering.interface import RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 

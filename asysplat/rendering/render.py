@@ -8,8 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.kernels.dispatch import check_device, check_float, choose_fastest, look_up_backend
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import (
+    check_device,
+    check_float,
+    choose_fastest,
+    look_up_backend,
+    without_autocast,
+)
 from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.interface import (

@@ -21,9 +21,9 @@ from asysplat.refinement import (
     StepSchedule,
     refine,
 )
-from asysplat.refinement.corrections import correct_poses
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
 from asysplat.refinement.densification.spawn import MIN_OPACITY
+from asysplat.refinement.fields import correct_poses
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views

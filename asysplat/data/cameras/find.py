@@ -28,7 +28,7 @@ from asysplat.data.cameras.folder import (
 from asysplat.data.frames import SUFFIXES, save_sharp_frames
 from asysplat.data.images import image_size
 from asysplat.data.readers import open_scene, photographs_in
-from asysplat.data.readers.masks import find_mask
+from asysplat.data.readers.additions import find_mask
 from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.images import HEIF, image_size, load_mask
+from asysplat.data.readers.additions import FOLDER as MASKS
 from asysplat.data.readers.common import check_map_size
-from asysplat.data.readers.masks import FOLDER as MASKS
 from asysplat.files import check_room, make_folder
 
 ERRORS = "errors.json"  # file of the errors of refined cameras

@@ -34,9 +34,8 @@ from asysplat.data.readers import (
     scannetpp_depths,
     transforms,
 )
+from asysplat.data.readers.additions import with_faces, with_masks
 from asysplat.data.readers.common import DEPTH, SUFFIXES, images_in, natural_order
-from asysplat.data.readers.masks import with_masks
-from asysplat.data.readers.panoramas import with_faces
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.files import check_exists, check_regular

@@ -18,8 +18,8 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
+from asysplat.data.readers.additions import panorama
 from asysplat.data.readers.colmap_model import read_model
-from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.files import has_file

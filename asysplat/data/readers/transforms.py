@@ -18,9 +18,9 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import PANORAMA, Lens, image_size
 from asysplat.data.readers import common
+from asysplat.data.readers.additions import panorama
 from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.readers.common import number
-from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.files import has_file

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from asysplat.kernels.precision import to_float64
+from asysplat.kernels.dispatch import to_float64
 from asysplat.scene import Cameras
 
 SAMPLES = 6  # points along each side of a view that stand for all its pixels

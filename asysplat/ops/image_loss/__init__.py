@@ -11,8 +11,8 @@ from asysplat.kernels.dispatch import (
     check_kernel_backend,
     check_shape,
     look_up_backend,
+    without_autocast,
 )
-from asysplat.kernels.precision import without_autocast
 from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
 
 

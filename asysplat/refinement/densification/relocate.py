@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.motion import rotations
-from asysplat.kernels.precision import to_float64
+from asysplat.kernels.dispatch import to_float64
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields

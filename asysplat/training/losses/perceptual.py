@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.evaluation.backbones import IMAGENET_STD, Backbone, VGGFeatures, find_backbone
-from asysplat.kernels.precision import without_autocast
+from asysplat.kernels.dispatch import without_autocast
 
 
 class PerceptualDistance(nn.Module):

@@ -15,7 +15,7 @@ from asysplat.data.cameras.choose import CameraOptions, refine_given
 from asysplat.data.check.report import check_scene
 from asysplat.data.images import PANORAMA, undistort
 from asysplat.data.photographs import open_photographs
-from asysplat.data.readers.panoramas import YAWS, panorama
+from asysplat.data.readers.additions import YAWS, panorama
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 
