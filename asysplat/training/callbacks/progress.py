@@ -13,9 +13,16 @@ LINE_SECONDS = 60  # from a line to the next, at least, unless a validation is b
 
 
 def show_progress() -> Callback:
-    """Return Lightning's bar, or `ProgressLines` without a terminal of one's own."""
+    """Return a bar, or `ProgressLines` without a terminal of one's own."""
     alone = current_process().name == "MainProcess"  # bars of jobs side by side overwrite another
-    return RichProgressBar() if alone and sys.stdout.isatty() else ProgressLines()
+    return StepsBar() if alone and sys.stdout.isatty() else ProgressLines()
+
+
+class StepsBar(RichProgressBar):
+    """Lightning's bar, from a validation to the next, with the step of the whole training."""
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return f"from step {self.trainer.global_step} of {self.trainer.max_steps}"
 
 
 class ProgressLines(Callback):
