@@ -6,9 +6,9 @@ glTF's axes are left, up, forward.
 
 import json
 import math
-import reprlib
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +17,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.json_record import JsonRecord, parse_record
-from asysplat.export.formats.packing import TINY, half_turn, prepare_for_export, require_file
+from asysplat.export.formats.packing import (
+    TINY,
+    half_turn,
+    prepare_for_export,
+    reading,
+    require_file,
+)
 from asysplat.files import atomic_write
 from asysplat.geometry.motion import rotations, transform
 from asysplat.geometry.spherical_harmonics import SH_C0
@@ -37,7 +42,6 @@ COMPONENTS = {
     "uint8": {"componentType": 5121, "normalized": True},
 }
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # of accessors, by their number of components
-MAX_STRIDE = 252  # bytes from one element to the next
 TOLERANCE = 1e-4  # of rotations that others wrote in float32
 
 
@@ -109,31 +113,29 @@ def read_glb(path: str | Path) -> Gaussians:
     along all axes.
     """
     path = require_file(path)
-    root, buffer = _read_chunks(path)
-    required = root.texts("extensionsRequired", default=[])
-    if others := [name for name in required if name != EXTENSION]:
+    with reading(path):
+        return _read(path, memoryview(path.read_bytes())).validate(f"{path}: Gaussians")
+
+
+def _read(path: Path, content: memoryview) -> Gaussians:
+    root, buffer = _read_chunks(path, content)
+    if others := [name for name in root.get("extensionsRequired", ()) if name != EXTENSION]:
         raise InputError(
-            f"{path} needs the extension {reprlib.repr(others[0])}: expected no other than "
-            f"{EXTENSION}; write it without compression."
+            f"{path} needs the extension {others[0]}: expected no other than {EXTENSION}; write it "
+            "without compression."
         )
-    primitive, motion = _find(root)
-    _check_kernel(primitive)
-    attributes = primitive.record("attributes")
-
-    def read(name: str, size: int) -> Float[Tensor, "N size"]:
-        return torch.from_numpy(_read_accessor(root, buffer, attributes, name, size))
-
-    degree = max(d for d in range(4) if d == 0 or _sh_names(16)[d * d] in attributes.values)
+    primitive, motion = _find(path, root)
+    kernel = primitive["extensions"][EXTENSION]
+    if kernel.get("extensions") or kernel | KERNEL != kernel:
+        raise InputError(f"{path} has Gaussians of {kernel}: expected {KERNEL}, not compressed.")
+    attributes = primitive["attributes"]
+    degree = max(d for d in range(4) if d == 0 or _sh_names(16)[d * d] in attributes)
     names = {"POSITION": 3, ROTATION: 4, SCALE: 3, OPACITY: 1}
     names |= dict.fromkeys(_sh_names((degree + 1) ** 2), 3)
-    columns = {name: read(name, size) for name, size in names.items()}
-    counts = {name: len(column) for name, column in columns.items()}
-    if odd := [name for name in counts if counts[name] != counts["POSITION"]]:
-        raise InputError(
-            f"{path} has {counts['POSITION']} of POSITION and {counts[odd[0]]} of {odd[0]}: "
-            "expected as many; write it again."
-        )
-    means, quats, scales, opacities, *sh = columns.values()
+    means, quats, scales, opacities, *sh = (
+        torch.from_numpy(_read_accessor(path, root, buffer, attributes[name], size))
+        for name, size in names.items()
+    )
     if not (quats != 0).any(1).all():
         raise InputError(f"{path} has a rotation of 0: repair or remove that Gaussian.")
     gaussians = Gaussians(
@@ -143,53 +145,35 @@ def read_glb(path: str | Path) -> Gaussians:
         opacities=torch.where(opacities == 0, TINY, opacities)[:, 0],
         sh=torch.stack(sh, 1),
     )
-    gaussians = _move(path, gaussians, motion)
-    return half_turn(gaussians, 2).validate(f"{path}: Gaussians")
+    return half_turn(_move(path, gaussians, motion), 2)
 
 
-def _read_chunks(path: Path) -> tuple[JsonRecord, memoryview]:
+def _read_chunks(path: Path, content: memoryview) -> tuple[dict[str, Any], memoryview]:
     """Read the JSON of a file and the bytes of its buffer."""
-    content = memoryview(path.read_bytes())
-    if len(content) < HEADER.size or bytes(content[:4]) != MAGIC:
-        raise InputError(
-            f"{path} is not binary glTF: expected {MAGIC.decode()} at its beginning; write .glb."
-        )
-    _, version, total = HEADER.unpack_from(content)
-    if version != VERSION:
-        raise InputError(f"{path} has glTF's version {version}: expected {VERSION}.")
+    magic, version, total = HEADER.unpack_from(content)
+    if magic != MAGIC or version != VERSION:
+        raise InputError(f"{path} is not binary glTF of version {VERSION}: write .glb.")
     chunks, start = {}, HEADER.size
     while start < total:
-        if total > len(content) or start + CHUNK.size > total:
-            raise _cut_off(path)
         size, kind = CHUNK.unpack_from(content, start)
         start += CHUNK.size
-        if start + size > total:
-            raise _cut_off(path)
         chunks.setdefault(kind, content[start : start + size])
         start += size
-    if JSON not in chunks:
-        raise _cut_off(path)
-    return parse_record(path, "JSON", bytes(chunks[JSON])), chunks.get(BINARY, content[:0])
+    return json.loads(bytes(chunks[JSON])), chunks.get(BINARY, content[:0])
 
 
-def _find(root: JsonRecord) -> tuple[JsonRecord, Float[Tensor, "4 4"]]:
+def _find(path: Path, root: dict[str, Any]) -> tuple[dict[str, Any], Float[Tensor, "4 4"]]:
     """Find the one primitive of Gaussians, and compute its transform to the scene."""
-    nodes, meshes = root.records("nodes", []), root.records("meshes", [])
-    parents, found = {}, []
+    nodes, parents, found = root.get("nodes", []), {}, []
     for index, node in enumerate(nodes):
-        for child in node.integers("children", len(nodes)):
-            parents[child] = index
-        if "mesh" in node.values:
-            mesh = meshes[node.integer("mesh", 0, len(meshes) - 1)]
-            found += [
-                (index, primitive)
-                for primitive in mesh.records("primitives")
-                if EXTENSION in primitive.record("extensions", {}).values
-            ]
+        parents |= dict.fromkeys(node.get("children", ()), index)
+        if "mesh" in node:
+            primitives = root["meshes"][node["mesh"]]["primitives"]
+            found += [(index, p) for p in primitives if EXTENSION in p.get("extensions", ())]
     if len(found) != 1:
         raise InputError(
-            f"{root.path} has {len(found)} primitives with {EXTENSION} in its nodes: expected one; "
-            "join them in the program that wrote it."
+            f"{path} has {len(found)} primitives with {EXTENSION} in its nodes: expected one; join "
+            "them in the program that wrote it."
         )
     ((index, primitive),) = found
     motion = torch.eye(4, dtype=torch.float64)
@@ -198,17 +182,17 @@ def _find(root: JsonRecord) -> tuple[JsonRecord, Float[Tensor, "4 4"]]:
         if index not in parents:
             return primitive, motion
         index = parents[index]
-    raise InputError(f"{root.path} has a node within itself: expected a tree; write it again.")
+    raise InputError(f"{path} has a node within itself: expected a tree; write it again.")
 
 
-def _local_transform(node: JsonRecord) -> Float[Tensor, "4 4"]:
+def _local_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     matrix = torch.eye(4, dtype=torch.float64)
-    if "matrix" in node.values:
-        return matrix.new_tensor(node.numbers("matrix", 16)).view(4, 4).mT
-    x, y, z, w = node.numbers("rotation", 4, [0.0, 0.0, 0.0, 1.0])
-    scale = matrix.new_tensor(node.numbers("scale", 3, [1.0, 1.0, 1.0]))
+    if "matrix" in node:
+        return matrix.new_tensor(node["matrix"]).view(4, 4).mT
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    scale = matrix.new_tensor(node.get("scale", (1.0, 1.0, 1.0)))
     matrix[:3, :3] = rotations(matrix.new_tensor([w, x, y, z])) * scale
-    matrix[:3, 3] = matrix.new_tensor(node.numbers("translation", 3, [0.0, 0.0, 0.0]))
+    matrix[:3, 3] = matrix.new_tensor(node.get("translation", (0.0, 0.0, 0.0)))
     return matrix
 
 
@@ -229,49 +213,21 @@ def _move(path: Path, gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gau
     return transform(gaussians.scale_by(scale.item()), rigid)
 
 
-def _check_kernel(primitive: JsonRecord) -> None:
-    """Check that the Gaussians are of the kind that the renderer draws, and not compressed."""
-    primitive.integer("mode", POINTS, POINTS)
-    splats = primitive.record("extensions").record(EXTENSION)
-    for key, value in KERNEL.items():
-        splats.value(key, lambda found, value=value: found == value, f"{value!r}", value)
-    splats.value("extensions", lambda found: found == {}, "no extensions, such as compression", {})
-
-
 def _read_accessor(
-    root: JsonRecord, buffer: memoryview, attributes: JsonRecord, name: str, size: int
+    path: Path, root: dict[str, Any], buffer: memoryview, index: int, size: int
 ) -> Float[ndarray, "N size"]:
     """Read the numbers of an attribute."""
-    accessors, views = root.records("accessors"), root.records("bufferViews")
-    accessor = accessors[attributes.integer(name, 0, len(accessors) - 1)]
-    kind = KINDS[size]
-    accessor.value("type", lambda found: found == kind, f"{kind} for {name}")
-    accessor.value("sparse", lambda found: found is None, "none: its numbers one by one")
-    component = accessor.value(
-        "componentType",
-        lambda found: type(found) is int and found in TYPES,
-        f"one of {', '.join(map(str, TYPES))}",
-    )
-    view = views[accessor.integer("bufferView", 0, len(views) - 1)]
-    view.value("extensions", lambda found: not found, "none, such as compression")
-    view.integer("buffer", 0, 0)
-    dtype = np.dtype(TYPES[component])
-    start = view.integer("byteOffset", 0, len(buffer), 0)
-    length = view.integer("byteLength", 1, len(buffer) - start)
-    offset = accessor.integer("byteOffset", 0, length, 0)
-    element = dtype.itemsize * size
-    stride = view.integer("byteStride", element, MAX_STRIDE, element)
-    # The last element may end with the view, before a whole stride.
-    count = accessor.integer("count", 1, (length - offset - element) // stride + 1)
-    array = np.ndarray((count, size), dtype, buffer, start + offset, (stride, dtype.itemsize))
-    values = array.astype(np.float32)
-    normalized = accessor.value(
-        "normalized", lambda found: isinstance(found, bool), "true or false", False
-    )
-    if normalized and dtype.kind != "f":
+    accessor = root["accessors"][index]
+    view = root["bufferViews"][accessor["bufferView"]]
+    if "sparse" in accessor or "extensions" in view or accessor["type"] != KINDS[size]:
+        raise InputError(
+            f"{path} has accessor {index} of {accessor['type']}: expected {KINDS[size]}, neither "
+            "sparse nor compressed."
+        )
+    dtype = np.dtype(TYPES[accessor["componentType"]])
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    strides = view.get("byteStride", dtype.itemsize * size), dtype.itemsize
+    values = np.ndarray((accessor["count"], size), dtype, buffer, start, strides).astype(np.float32)
+    if accessor.get("normalized") and dtype.kind != "f":
         values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
     return values
-
-
-def _cut_off(path: Path) -> InputError:
-    return InputError(f"{path} is cut off or damaged: its chunks have other sizes; copy it again.")

@@ -1,5 +1,10 @@
-"""What compressed formats share: an order in space, packed rotations, and axes."""
+"""What formats share: an order in space, packed rotations, axes, one error of damaged files."""
 
+import struct
+import zipfile
+import zlib
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +18,8 @@ from asysplat.geometry.spherical_harmonics import sh_basis
 from asysplat.scene import Gaussians
 
 MORTON_BITS = 21  # of each coordinate; three fit into 64
+MAX_TEXT = 80  # characters of another error's in a message
+DAMAGE = (AttributeError, EOFError, ValueError, struct.error, zipfile.BadZipFile, zlib.error)
 GENERIC_DIRECTION = (0.36, 0.48, 0.8)  # no SH function up to degree 3 is 0 along it
 
 
@@ -88,6 +95,20 @@ def half_turn(gaussians: Gaussians, axis: int) -> Gaussians:
 
 
 TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that round to 0
+
+
+@contextmanager
+def reading(path: Path) -> Generator[None]:
+    """Turn any error of a file that is cut off, or of another kind, into one that names it."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (*DAMAGE, ArithmeticError, LookupError, OSError, RuntimeError, TypeError) as error:
+        raise InputError(
+            f"{path} cannot be read ({type(error).__name__}: {str(error)[:MAX_TEXT]}): it is "
+            "damaged or no file of this format; copy or write it again."
+        ) from error
 
 
 def require_file(path: str | Path) -> Path:

@@ -6,13 +6,11 @@ PLY's axes. Pixel i of each image belongs to Gaussian i.
 
 import json
 import math
-import reprlib
-import struct
-import warnings
 import zipfile
-import zlib
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,12 +20,12 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.json_record import JsonRecord, parse_record
 from asysplat.export.formats.packing import (
     TINY,
     in_morton_order,
     join_largest,
     prepare_for_export,
+    reading,
     require_file,
     split_largest,
 )
@@ -45,12 +43,6 @@ PALETTE_ITERATIONS = 4
 CODEBOOK_ITERATIONS = 50
 METHOD, QUALITY = 2, 50  # of WebP: what takes ten times as long saves 0.1 %
 FIRST_TAG = 252  # alpha of a rotation whose w is the largest; then x, y, z
-MAX_TEXT = 80  # characters of a library's message
-SLACK = 1 << 20  # bytes or pixels that a small file may have beyond what it needs
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError)
-ZIP_ERRORS += (RuntimeError, OverflowError)  # encrypted; offsets beyond 64 bits
-IMAGE_ERRORS = (OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError)
-IMAGE_ERRORS += (Image.DecompressionBombWarning, Image.DecompressionBombError)
 
 
 def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> None:
@@ -229,147 +221,67 @@ def _k_means(
 def read_sog(path: str | Path) -> Gaussians:
     """Read one scene from a SOG bundle of version 2."""
     path = require_file(path)
-    with _open(path) as archive:
-        meta = _read_meta(archive, path)
-        count = meta.integer("count", 1, MAX_SIDE**2)
-        means, scales, quats, colors = map(meta.record, ("means", "scales", "quats", "sh0"))
-        low, high = (torch.tensor(means.numbers(key, 3)).double() for key in ("mins", "maxs"))
-        fine, coarse = _images(archive, means, count, count)
-        (rotations,) = _images(archive, quats, count)
-        (sizes,) = _images(archive, scales, count)
-        (rgba,) = _images(archive, colors, count)
-        fine, coarse, rotations, sizes, rgba = (
-            image.flatten(0, 1)[:count] for image in (fine, coarse, rotations, sizes, rgba)
+    with reading(path), zipfile.ZipFile(path) as archive:
+        meta = _read_meta(path, archive)
+        count = meta["count"]
+
+        def images(name: str) -> Iterator[UInt8[Tensor, "N 4"]]:
+            return (_image(archive, file).flatten(0, 1)[:count] for file in meta[name]["files"])
+
+        low, high = (torch.tensor(meta["means"][key]).double() for key in ("mins", "maxs"))
+        fine, coarse = images("means")
+        (rotations,), (sizes,), (rgba,) = map(images, ("quats", "scales", "sh0"))
+        sh = [_decode(meta["sh0"], rgba[:, None, :3])]
+        if "shN" in meta:
+            sh.append(_read_palette(archive, meta["shN"], count))
+        fixed = coarse[:, :3].int() << 8 | fine[:, :3]
+        logs = low + (high - low) * fixed / 65535
+        gaussians = Gaussians(
+            means=(logs.sign() * logs.abs().expm1()).float(),
+            quats=_quats(rotations),
+            scales=_decode(meta["scales"], sizes[:, :3]).exp().clamp_min(TINY),
+            opacities=(rgba[:, 3] / 255).clamp_min(TINY),
+            sh=torch.cat(sh, 1),
         )
-        sh = [_decode(colors, rgba[:, None, :3])]
-        if "shN" in meta.values:
-            sh.append(_read_palette(archive, meta.record("shN"), count))
-    fixed = coarse[:, :3].int() << 8 | fine[:, :3]
-    logs = low + (high - low) * fixed / 65535
-    gaussians = Gaussians(
-        means=(logs.sign() * logs.abs().expm1()).float(),
-        quats=_quats(path, rotations),
-        scales=_decode(scales, sizes[:, :3]).exp().clamp_min(TINY),
-        opacities=(rgba[:, 3] / 255).clamp_min(TINY),
-        sh=torch.cat(sh, 1),
-    )
-    return gaussians.validate(f"{path}: Gaussians")
+        return gaussians.validate(f"{path}: Gaussians")
 
 
 def is_antialiased(path: Path) -> bool:
     """Read whether a file is to be rendered with `antialiased`."""
-    with _open(path) as archive:
-        return _read_meta(archive, path).values.get("antialias") is True
+    with reading(path), zipfile.ZipFile(path) as archive:
+        return _read_meta(path, archive).get("antialias") is True
 
 
-def _open(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except ZIP_ERRORS as error:
-        raise InputError(
-            f"{path} cannot be read as a zip file ({error}): it is damaged or no SOG bundle; copy "
-            "it again."
-        ) from error
-
-
-def _read_meta(archive: zipfile.ZipFile, path: Path) -> JsonRecord:
-    meta = parse_record(path, "meta.json", _content(archive, path, "meta.json"))
-    meta.integer("version", VERSION, VERSION)
+def _read_meta(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+    meta = json.loads(archive.read("meta.json"))
+    if meta["version"] != VERSION:
+        raise InputError(f"{path} has SOG's version {meta['version']}: expected {VERSION}.")
     return meta
 
 
-def _decode(record: JsonRecord, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    return torch.tensor(record.numbers("codebook", CODES))[codes.int()]
+def _decode(record: dict[str, Any], codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    return torch.tensor(record["codebook"], dtype=torch.float32)[codes.int()]
 
 
-def _quats(path: Path, rotations: UInt8[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
+def _quats(rotations: UInt8[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
     tags = rotations[:, 3].numpy().astype(np.int64) - FIRST_TAG
     if (tags < 0).any():
-        index = int(np.argmin(tags))
-        raise InputError(
-            f"{path} has the alpha {rotations[index, 3]} in rotation {index}: expected {FIRST_TAG} "
-            "to 255; copy it again."
-        )
+        raise ValueError(f"a rotation has an alpha below {FIRST_TAG}")
     rest = (rotations[:, :3].numpy() / 127.5 - 1) / math.sqrt(2)
     return join_largest(tags, rest).float()
 
 
 def _read_palette(
-    archive: zipfile.ZipFile, record: JsonRecord, count: int
+    archive: zipfile.ZipFile, record: dict[str, Any], count: int
 ) -> Float[Tensor, "N terms 3"]:
     """Read the SH of degree 1 and above."""
-    degree, size = record.integer("bands", 1, 3), record.integer("count", 1, MAX_PALETTE)
-    terms = degree * (degree + 2)
-    centroids, labels = _images(archive, record, size * terms, count)
-    if centroids.shape[1] != PALETTE_WIDTH * terms:
-        raise InputError(
-            f"{record.path} has an image of SH that is {centroids.shape[1]} pixels wide: expected "
-            f"{PALETTE_WIDTH * terms}; write it again."
-        )
+    terms = record["bands"] * (record["bands"] + 2)
+    centroids, labels = (_image(archive, file) for file in record["files"])
     low, high = labels.flatten(0, 1)[:count, :2].long().unbind(1)
-    indices = low | high << 8
-    if int(indices.max()) >= size:
-        raise InputError(
-            f"{record.path} has the SH {indices.max()} in its labels: expected 0 to {size - 1}; "
-            "copy it again."
-        )
-    palette = centroids[..., :3].reshape(-1, terms, 3)[:size]
-    return _decode(record, palette)[indices]
+    palette = centroids[..., :3].reshape(-1, terms, 3)[: record["count"]]
+    return _decode(record, palette)[low | high << 8]
 
 
-def _images(
-    archive: zipfile.ZipFile, record: JsonRecord, *counts: int
-) -> list[UInt8[Tensor, "height width 4"]]:
-    """Read a record's images, of these numbers of pixels or some more, in RGBA."""
-    names = record.texts("files")
-    if len(names) != len(counts):
-        raise InputError(
-            f"{record.path} has {len(names)} files in its {record.name}: expected {len(counts)}; "
-            "write it again."
-        )
-    return [_image(archive, record.path, *item) for item in zip(names, counts, strict=True)]
-
-
-def _image(
-    archive: zipfile.ZipFile, path: Path, name: str, count: int
-) -> UInt8[Tensor, "height width 4"]:
-    content, title = _content(archive, path, name), reprlib.repr(name)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(BytesIO(content), formats=("WEBP",))
-        # Before decoding: a small file may declare an image that fills the memory.
-        fits = count <= image.width * image.height <= 4 * count + SLACK
-        decoded = np.array(image.convert("RGBA")) if fits else None
-    except IMAGE_ERRORS as error:
-        raise InputError(
-            f"{path} has {title}, which cannot be read as WebP ({error}): it is damaged; copy it "
-            "again."
-        ) from error
-    if decoded is None:
-        raise InputError(
-            f"{path} has {image.width} x {image.height} pixels in {title}: expected about {count} "
-            "in all; write it again."
-        )
-    return torch.from_numpy(decoded)
-
-
-def _content(archive: zipfile.ZipFile, path: Path, name: str) -> bytes:
-    """Read a member of a zip file, no larger than the file itself but for little ones."""
-    title, limit = reprlib.repr(name), path.stat().st_size + SLACK
-    try:
-        info = archive.getinfo(name)
-        if info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            if info.file_size <= limit:
-                return archive.read(info)
-            reason = f"its size of {info.file_size} bytes is none of images"
-        else:
-            reason = "it is neither stored nor deflated"
-    except KeyError:
-        reason = "it is absent"
-    except ZIP_ERRORS as error:
-        reason = str(error)[:MAX_TEXT]
-    raise InputError(
-        f"{path} has no {title} that can be read ({reason}): expected meta.json and its images; "
-        "copy it again."
-    )
+def _image(archive: zipfile.ZipFile, name: str) -> UInt8[Tensor, "height width 4"]:
+    image = Image.open(BytesIO(archive.read(name)), formats=("WEBP",))
+    return torch.from_numpy(np.array(image.convert("RGBA")))
