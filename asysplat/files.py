@@ -63,17 +63,6 @@ def check_exists(path: Path, expected: str) -> None:
         raise InputError(f"{path} does not exist: name {expected}.")
 
 
-def has_file(path: Path) -> bool:
-    """Return whether a file exists; False for a name that is too long for any."""
-    return os.path.isfile(path)  # Path.is_file raises OSError
-
-
-def check_regular(path: str | Path) -> None:
-    """Check that a path is no pipe or device, which may have no end."""
-    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
-        raise InputError(f"{path} is a pipe or a device: put a file in its place.")
-
-
 def read_text(path: Path) -> str:
     """Read UTF-8 text, with or without a byte order mark."""
     try:

@@ -23,7 +23,6 @@ from PIL import Image
 from PIL.ImageFile import ImageFile as OpenedImage
 
 from asysplat.errors import InputError
-from asysplat.files import has_file
 
 HEIF = (".heic", ".heif")  # suffixes of what phones save
 # Pillow goes by the content and knows more, some of which start other programs (EPS).
@@ -312,7 +311,7 @@ def _register_heif() -> bool:
 
 
 def _check_exists(path: Path) -> None:
-    if not has_file(path):
+    if not path.is_file():
         raise InputError(f"{path} does not exist: put the image there, or leave it out.")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes): copy it again, or leave it out.")

@@ -13,7 +13,6 @@ tests/data/readers/layouts/NAME.py. A data set in a known layout needs no code: 
 conf/data/mipnerf360.yaml.
 """
 
-import os
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,10 +34,10 @@ from asysplat.data.readers import (
     transforms,
 )
 from asysplat.data.readers.additions import with_faces, with_masks
-from asysplat.data.readers.common import DEPTH, SUFFIXES, images_in, natural_order
+from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
-from asysplat.files import check_exists, check_regular
+from asysplat.files import check_exists
 
 MAX_NAME = 200  # characters of a path in a message
 # In this order: the first layout that fits a folder reads it.
@@ -116,20 +115,7 @@ def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
     Errors of single images are collected.
     """
     with _file_errors(scene):
-        if scene.is_dir():
-            _check_files(scene)
         return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad), bad)
-
-
-def _check_files(folder: Path, depth: int = DEPTH) -> None:
-    """Raise InputError for a pipe or a device in a folder, or some folders below."""
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_dir():
-                if depth > 0:
-                    _check_files(Path(entry.path), depth - 1)
-            elif not entry.is_file():
-                check_regular(entry.path)
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:

@@ -9,7 +9,6 @@ from asysplat.data.images import PANORAMA, Lens, has_alpha, same_proportions
 from asysplat.data.readers.common import check_map_size
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import has_file
 
 FOLDER = "masks"
 
@@ -44,7 +43,7 @@ def find_mask(photograph: Path) -> Path | None:
     else:
         masks = images.parent / FOLDER / folder.relative_to(images)
     for name in (f"{photograph.name}.png", f"{photograph.stem}.png", photograph.name):
-        if has_file(masks / name):
+        if (masks / name).is_file():
             return masks / name
     return photograph if has_alpha(photograph) else None
 

@@ -22,7 +22,6 @@ from asysplat.data.readers.additions import panorama
 from asysplat.data.readers.colmap_model import read_model
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import has_file
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
@@ -119,7 +118,9 @@ def _lens(camera: pycolmap.Camera, where: str) -> Lens:
 
 
 def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
-    counts = {folder: sum(has_file(scene / folder / name) for name in names) for folder in FOLDERS}
+    counts = {
+        folder: sum((scene / folder / name).is_file() for name in names) for folder in FOLDERS
+    }
     best = max(counts, key=lambda folder: counts[folder])
     if counts[best] == 0:
         named = f"names {len(names)} images, such as {names[0]}" if names else "registers no image"

@@ -46,14 +46,10 @@ def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:
     ]
 
 
-def natural_order(path: Path) -> list[str | tuple[int, str]]:
+def natural_order(path: Path) -> list[str | int]:
     """Return a sort key by the numbers in the path: 2 before 10."""
     parts = re.split(r"([0-9]+)", path.as_posix())
-    # A number by its length, then its digits: int refuses thousands of them.
-    numbers = [part.lstrip("0") for part in parts[1::2]]
-    keys: list[str | tuple[int, str]] = [*parts]
-    keys[1::2] = [(len(number), number) for number in numbers]
-    return keys
+    return [int(part) if part.isdecimal() else part for part in parts]
 
 
 def read_frames(file: Path) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from asysplat.data.readers import common
 from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import has_file, read_json
+from asysplat.files import read_json
 
 EXTRACT = (
     "extract rgb.mkv (or rgb.mp4) with the toolkit's iphone.prepare_iphone_data, or with "
@@ -135,7 +135,7 @@ def _transforms(
 def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
     """Return training entries and published test entries that are not marked as bad."""
     test = [entry for entry in content.get("test_frames", []) if isinstance(entry, dict)]
-    if not any(has_file(images / str(entry.get("file_path"))) for entry in test):
+    if not any((images / str(entry.get("file_path"))).is_file() for entry in test):
         test = []  # hidden ones, or the DSLR's in the iPhone's file
     frames = content["frames"] + test
     good = [entry for entry in frames if not (isinstance(entry, dict) and entry.get("is_bad"))]

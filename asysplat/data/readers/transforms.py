@@ -23,7 +23,6 @@ from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.readers.common import number
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import has_file
 from asysplat.scene import Cameras
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # read as OPENCV
@@ -77,7 +76,7 @@ def read_images(
             raise InputError(f"{where} has the file_path {image}: name its image.")
         # The path may lack the file's extension.
         paths = [image.with_name(image.name + suffix) for suffix in ("", ".png", ".jpg")]
-        image = next(filter(has_file, paths), image)
+        image = next((path for path in paths if path.is_file()), image)
         size = image_size(image)
         if not ("w" in entry and "h" in entry):
             shared.append((image, size))
