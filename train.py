@@ -25,9 +25,9 @@ from asysplat.runs.runs import find_run
 from asysplat.training.prepare import (
     PreparedRun,
     TrainingStage,
+    drop_missing_perceptual_term,
     instantiate_option,
     prepare_run,
-    without_missing_network,
 )
 from asysplat.training.run_folder import job_name, run_folder, unused_removed
 
@@ -79,14 +79,16 @@ def train_in_sweep(config: DictConfig) -> float | None:
     """
     job = HydraConfig.get().job
     try:
-        without_missing_network(config)  # before the finished run of what is left is looked for
+        # Before the finished run of what is left is looked for.
+        drop_missing_perceptual_term(config)
         finished = find_run(Path(config.paths.logs), config)
         if finished is None or (config.rerun and finished.revision != revision()):
             print(f"job {job.num}: {job.override_dirname}", flush=True)
             return train(config)
-        other = f" by {finished.revision}, while this is {revision()}; to run it again: rerun=true"
-        other = "" if finished.revision == revision() else other
-        print(f"job {job.num}: finished already{other}\nrun: {finished.folder}", flush=True)
+        note = ""
+        if finished.revision != revision():
+            note = f" by {finished.revision}, while this is {revision()}; again with rerun=true"
+        print(f"job {job.num}: finished already{note}\nrun: {finished.folder}", flush=True)
         return finished.results.get(f"test/{config.data.name}/psnr")
     except Exception as error:
         reason = error_message(error)

@@ -13,7 +13,7 @@ UNLIMITED = 10_000  # characters
 
 
 def make_console(stderr: bool = False) -> Console:
-    """Make a console that prints names as they are: "[b]" or ":x:" in that of a file is no markup.
+    """Make a console that prints names as they are: a "[b]" or ":x:" in a file name is no markup.
 
     It prints to the standard output, or to `stderr`.
     """

@@ -102,7 +102,7 @@ class TrainingStage:
     def begin(self, trainer: lightning.Trainer, data: SceneDataModule) -> None:
         """Divide the batches between the processes, and write config.yaml.
 
-        The last check is before it: an option that is refused leaves no folder.
+        Nothing is written before this call: a refused option leaves no folder.
         """
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
@@ -116,7 +116,7 @@ class TrainingStage:
 
     @contextmanager
     def resuming(self, trainer: lightning.Trainer) -> Generator[None]:
-        """Name the checkpoint in an error before the first step, which is of restoring it."""
+        """Turn an error while the checkpoint is restored into an InputError that names it."""
         try:
             yield
         except Exception as error:
@@ -153,11 +153,11 @@ class PreparedRun:
         """Collect what a tested stage measured; write metrics.json after the last; print it."""
         new_results = dict(callbacks["costs"].values) if "costs" in callbacks else {}
         new_results |= callbacks["metrics"].results if "metrics" in callbacks else {}
-        data, folder = self.config.data.name, stage.folder
-        shown, is_last = self.results | new_results, stage is self.stages[-1]
+        data, folder, is_last = self.config.data.name, stage.folder, stage is self.stages[-1]
+        shown = self.results | new_results
         if is_last:
             losses = {"run/losses": trainer.lightning_module.loss.describe()}
-            self.results = shown = self.fingerprint | losses | shown
+            shown = self.results = self.fingerprint | losses | shown
         else:
             stored = {k: v for k, v in new_results.items() if k.startswith(("test/", "cost/"))}
             self.results |= {f"{stage.config.stage}/{key}": v for key, v in stored.items()}
@@ -174,7 +174,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
     """Check a configuration, lock the run's folder and find the stages that are to be trained."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    without_missing_network(config)
+    drop_missing_perceptual_term(config)
     configs = stage_configs(config)
     check_stages(configs)
     find_accelerator(config.trainer.accelerator)  # refuses Apple's GPU before any work starts
@@ -205,7 +205,7 @@ def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None
         check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
 
 
-def without_missing_network(config: DictConfig) -> None:
+def drop_missing_perceptual_term(config: DictConfig) -> None:
     """Set the weight of the perceptual term to 0 if its network is not on this machine.
 
     The run is then hashed and recorded as what it is, a run without the term.

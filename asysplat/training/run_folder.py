@@ -79,7 +79,7 @@ def unused_removed(folder: Path) -> Generator[None]:
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Lock a run's folder for this process and those that it trains with, or raise InputError."""
+    """Lock a run's folder against other processes, but for those that it trains with."""
     # Attribute that Lightning adds to its function.
     if rank_zero_only.rank != 0:  # ty: ignore[missing-attribute]
         yield

@@ -23,7 +23,7 @@ from asysplat.training.losses.disparity import (
     reference_disparities,
 )
 from asysplat.training.losses.perceptual import longlrm, vgg16
-from asysplat.training.prepare import without_missing_network
+from asysplat.training.prepare import drop_missing_perceptual_term
 
 MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
 STD = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
@@ -250,12 +250,12 @@ def test_a_missing_network_turns_the_term_off_or_is_refused(
     command = [f"paths.weights={tmp_path}", f"training/perceptual={term}", "paths.run=here"]
     config = composed(*command, "training.loss.perceptual=0.5")
     with pytest.warns(UserWarning, match=f"weights of {name} are neither .* paths.weights"):
-        without_missing_network(config)
+        drop_missing_perceptual_term(config)
     assert config_hash(config) == config_hash(composed(*command, "training.loss.perceptual=0.0"))
     config = composed(*command, "training.loss.perceptual=0.5", "allow_missing_losses=false")
     message = r"perceptual=0.5: .* paths.download=true .* allow_missing_losses=true"
     with pytest.raises(InputError, match=message):
-        without_missing_network(config)
+        drop_missing_perceptual_term(config)
 
 
 def test_a_loss_without_any_term_is_refused():

@@ -44,7 +44,7 @@ class CameraOptions:
 def find_missing(
     path: Path | str, layout: str, on_error: Policy, options: CameraOptions
 ) -> Path | None:
-    """Return the folder of cameras that are found; None where the given ones are wanted."""
+    """Return the folder of cameras that are found; None if cameras are given."""
     bare = layout == "auto" and without_cameras(path) is not None
     if not bare and options.choice != "found":
         return None
