@@ -134,7 +134,7 @@ def change(file, **tensors):
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
-        ({"scales": None}, "has no scales: expected the fields means, quats, scales"),
+        ({"scales": None}, "no scales: expected the fields means, quats, scales"),
         ({"sh": torch.zeros(12, 5, 3)}, r"Gaussians\.sh has 5 coefficients"),
         ({"means": torch.full((12, 3), torch.nan)}, r"Gaussians\.means\[0\] holds NaN"),
         ({"opacities": torch.full((12,), 2.0)}, r"Gaussians\.opacities\[0\] lies outside"),
@@ -149,15 +149,7 @@ def test_safetensors_that_hold_no_scene_are_refused(written, tensors, message):
 def test_safetensors_of_none_or_of_several_scenes_are_refused(written, scene):
     for bad in (scene.keep(scene.opacities > 2), scene.stack([scene, scene])):
         change(written, **{f.name: getattr(bad, f.name) for f in fields(Gaussians)})
-        with pytest.raises(InputError, match=r"scene\.safetensors has opacities of shape .*\[N\]"):
-            read_safetensors(written)
-
-
-def test_safetensors_that_are_cut_off_are_refused(written):
-    stored = written.read_bytes()
-    for size in (0, 7, 100, -1):
-        written.write_bytes(stored[:size])
-        with pytest.raises(InputError, match=r"scene\.safetensors cannot be read as safetensors"):
+        with pytest.raises(InputError, match=r"scene\.safetensors: opacities have shape .*\[N\]"):
             read_safetensors(written)
 
 

@@ -196,21 +196,18 @@ VIEW, ACCESSOR = ("bufferViews", 0), ("accessors", 0)
     ("place", "key", "value", "message"),
     [
         ((), "extensionsRequired", ["KHR_draco"], "needs the extension KHR_draco"),
-        ((), "nodes", [], "has 0 primitives with KHR_gaussian_splatting in its nodes"),
-        ((), "nodes", [{"mesh": 0}] * 2, "has 2 primitives with KHR_gaussian_splatting"),
-        (("nodes", 0), "children", [0], "has a node within itself"),
-        (("nodes", 0), "scale", [1, 1, 2], "has nodes that stretch, shear or mirror"),
-        (("nodes", 0), "scale", [1, 1, -1], "has nodes that stretch, shear or mirror"),
-        (("nodes", 0), "scale", [0, 0, 0], "has nodes that stretch, shear or mirror"),
-        (("nodes", 0), "rotation", [0, 0, 0, 0], "has nodes that stretch, shear or mirror"),
-        (KERNEL, "colorSpace", "BT.2020", "BT.2020"),
-        (KERNEL, "extensions", {"KHR_spz": {}}, "expected .*, not compressed"),
-        (SPLATS, "attributes", {}, "cannot be read"),
-        (ACCESSOR, "sparse", {"count": 1}, "neither sparse nor compressed"),
-        (ACCESSOR, "count", 13, "cannot be read|has accessor"),
-        (ACCESSOR, "type", "VEC2", "has accessor 0 of VEC2: expected VEC3"),
-        (ACCESSOR, "componentType", 5125, "cannot be read"),
-        (VIEW, "extensions", {"EXT_meshopt_compression": {}}, "neither sparse nor compressed"),
+        ((), "nodes", [], "0 primitives with KHR_gaussian_splatting in its nodes"),
+        ((), "nodes", [{"mesh": 0}] * 2, "2 primitives with KHR_gaussian_splatting"),
+        (("nodes", 0), "scale", [1, 1, 2], "nodes stretch, shear or mirror"),
+        (("nodes", 0), "scale", [1, 1, -1], "nodes stretch, shear or mirror"),
+        (("nodes", 0), "scale", [0, 0, 0], "nodes stretch, shear or mirror"),
+        (KERNEL, "colorSpace", "BT.2020", "'BT.2020'.* expected .*'srgb_rec709_display'"),
+        (KERNEL, "extensions", {"KHR_spz": {}}, "KHR_spz.* expected uncompressed"),
+        (SPLATS, "mode", 4, "expected uncompressed points"),
+        (SPLATS, "attributes", {}, "cannot be read as binary glTF .*POSITION"),
+        (ACCESSOR, "sparse", {"count": 1}, "sparse, compressed"),
+        (VIEW, "extensions", {"EXT_meshopt_compression": {}}, "sparse, compressed"),
+        (VIEW, "buffer", 1, "in another file"),
     ],
 )
 def test_what_is_not_read_is_refused(written, place, key, value, message):
@@ -222,18 +219,3 @@ def test_what_is_not_read_is_refused(written, place, key, value, message):
     change(written[1], edit)
     with pytest.raises(InputError, match=rf"scene\.glb.*{message}"):
         read_glb(written[1])
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "cannot be read"),
-        (b"glTF" + struct.pack("<II", 1, 12), "is not binary glTF of version 2"),
-        (b"glTF" + struct.pack("<II", 2, 12), "cannot be read"),
-        (join({}, b""), "has 0 primitives"),
-    ],
-)
-def test_what_is_no_binary_gltf_is_refused(tmp_path, content, message):
-    (tmp_path / "scene.glb").write_bytes(content)
-    with pytest.raises(InputError, match=rf"scene\.glb {message}"):
-        read_glb(tmp_path / "scene.glb")

@@ -1,6 +1,5 @@
 """SPZ: what comes back, what is refused, and what another program reads."""
 
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -81,10 +80,6 @@ def test_means_that_24_bits_cannot_hold_are_refused(make_scene, file):
         write_spz(file, replace(scene, means=2.0**24 * torch.sign(scene.means)))
     with pytest.raises(InputError, match="version is 5: choose 2, 3 or 4"):
         write_spz(file, scene, 5)
-
-
-def changed(content, offset, kind, value):
-    return content[:offset] + struct.pack(kind, value) + content[offset + struct.calcsize(kind) :]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt32
+from jaxtyping import Float, UInt32
 from numpy import ndarray
 from numpy.lib.recfunctions import structured_to_unstructured
-from torch import Tensor
 
-from asysplat.errors import InputError
 from asysplat.export.formats.packing import (
     TINY,
     in_morton_order,
@@ -38,8 +36,6 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 XYZ_BITS, COLOR_BITS, ROTATION_BITS = (11, 10, 11), (8, 8, 8, 8), (2, 10, 10, 10)
 MAX_LOG_SCALE = 20
 SH_RANGE = 8  # from -4 to 4, in 256 steps
-REST_COUNTS = (9, 24, 45)  # numbers of SH above degree 0, for degrees 1 to 3
-ELEMENTS = ("chunk", "vertex", "sh")
 
 
 def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> None:
@@ -96,72 +92,35 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
         file.write(steps.tobytes())
 
 
-def unpack(path: Path, elements: dict[str, ndarray]) -> Gaussians:
+def unpack(elements: dict[str, ndarray]) -> Gaussians:
     """Compute the Gaussians of a compressed PLY file from its elements chunk, vertex and sh."""
-    vertices, chunks = elements["vertex"], elements.get("chunk")
-    if chunks is None or len(chunks) * CHUNK < len(vertices):
-        raise InputError(
-            f"{path} has {0 if chunks is None else len(chunks)} ranges for {len(vertices)} "
-            f"Gaussians: expected an element chunk with one for {CHUNK}; copy it again."
-        )
+    vertices, chunks = elements["vertex"], elements["chunk"]
     names = RANGES if "min_r" in chunks.dtype.names else RANGES[:12]
-    ranges = _columns(path, "chunk", chunks, names, np.float32).reshape(len(chunks), -1, 2, 3)
-    if not np.isfinite(ranges).all():
-        index = np.argwhere(~np.isfinite(ranges))[0][0]
-        raise InputError(f"{path} has a range {index} that is not finite: repair or remove it.")
+    ranges = structured_to_unstructured(chunks[names], np.float32).reshape(len(chunks), -1, 2, 3)
     ranges = ranges[np.arange(len(vertices)) // CHUNK]
-    packed = _columns(path, "vertex", vertices, PACKED, np.uint32).T
     (position, rotation, scale, color) = (
-        _unpack(numbers, bits)
-        for numbers, bits in zip(
-            packed, (XYZ_BITS, ROTATION_BITS, XYZ_BITS, COLOR_BITS), strict=True
-        )
+        _unpack(vertices[name].astype(np.uint32), bits)
+        for name, bits in zip(PACKED, (XYZ_BITS, ROTATION_BITS, XYZ_BITS, COLOR_BITS), strict=True)
     )
     rgb = _within(ranges[:, 2], color[:, :3]) if len(names) == len(RANGES) else color[:, :3]
-    color_sh = (torch.from_numpy(rgb) - 0.5).div(SH_C0).float()
+    sh = (torch.from_numpy(rgb) - 0.5).div(SH_C0).float()[:, None]
+    if "sh" in elements:
+        # The first and last step reach the ends of the range, the others stand for their middle.
+        places = (torch.arange(256, dtype=torch.float64) + 0.5) / 256
+        places[0], places[-1] = 0, 1
+        rows = elements["sh"]
+        rest = [f"f_rest_{i}" for i in range(len(rows.dtype.names))]
+        steps = torch.from_numpy(structured_to_unstructured(rows[rest], np.uint8))
+        values = (SH_RANGE * (places - 0.5)).float()
+        sh = torch.cat((sh, values[steps.int()].unflatten(1, (3, -1)).mT), 1)
     largest = (3 * rotation[:, 0]).round().astype(np.int64)
-    gaussians = Gaussians(
+    return Gaussians(
         means=torch.from_numpy(_within(ranges[:, 0], position)).float(),
         quats=join_largest(largest, (rotation[:, 1:] - 0.5) * 2**0.5).float(),
         scales=torch.from_numpy(_within(ranges[:, 1], scale)).exp().float().clamp_min(TINY),
         opacities=torch.from_numpy(color[:, 3]).float().clamp_min(TINY),
-        sh=torch.cat((color_sh[:, None], _rest(path, elements)), 1),
+        sh=sh,
     )
-    return gaussians.validate(f"{path}: Gaussians")
-
-
-def _rest(path: Path, elements: dict[str, ndarray]) -> Float[Tensor, "N K 3"]:
-    """Compute SH above degree 0 from the element sh."""
-    count, rows = len(elements["vertex"]), elements.get("sh")
-    if rows is None:
-        return torch.zeros(count, 0, 3)
-    names = [f"f_rest_{i}" for i in range(len(rows.dtype.names))]
-    if len(rows) != count or len(names) not in REST_COUNTS:
-        raise InputError(
-            f"{path} has {len(rows)} rows of {len(names)} properties in its element sh: expected "
-            f"{count} rows of {' or '.join(map(str, REST_COUNTS))}; copy it again."
-        )
-    # The first and the last step reach the ends of the range, the others stand for their middle.
-    places = (torch.arange(256, dtype=torch.float64) + 0.5) / 256
-    places[0], places[-1] = 0, 1
-    values = (SH_RANGE * (places - 0.5)).float()
-    steps = torch.from_numpy(_columns(path, "sh", rows, names, np.uint8))
-    return values[steps.int()].unflatten(1, (3, -1)).mT
-
-
-def _columns(
-    path: Path, element: str, rows: ndarray, names: Sequence[str], dtype: type
-) -> Shaped[ndarray, "N columns"]:
-    """Return properties as columns; other types are refused as the format fixes them."""
-    types = dict(rows.dtype.fields)
-    for name in names:
-        if name not in types or types[name][0].newbyteorder("=") != np.dtype(dtype):
-            found = types[name][0].name if name in types else "none"
-            raise InputError(
-                f"{path} has the property {name} of its element {element} as {found}: expected "
-                f"{np.dtype(dtype).name}; write it again."
-            )
-    return structured_to_unstructured(rows[list(names)], dtype)
 
 
 def _pack(places: Float[ndarray, "N k"], bits: Sequence[int]) -> UInt32[ndarray, "N"]:

@@ -17,13 +17,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.packing import (
-    TINY,
-    half_turn,
-    prepare_for_export,
-    reading,
-    require_file,
-)
+from asysplat.export.formats.packing import TINY, half_turn, prepare_for_export, reading
 from asysplat.files import atomic_write
 from asysplat.geometry.motion import rotations, transform
 from asysplat.geometry.spherical_harmonics import SH_C0
@@ -41,7 +35,8 @@ COMPONENTS = {
     "float32": {"componentType": 5126},
     "uint8": {"componentType": 5121, "normalized": True},
 }
-KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # of accessors, by their number of components
+SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}  # numbers of components by the kind of accessor
+KINDS = {size: kind for kind, size in SIZES.items()}
 TOLERANCE = 1e-4  # of rotations that others wrote in float32
 
 
@@ -112,77 +107,73 @@ def read_glb(path: str | Path) -> Gaussians:
     The file may hold other meshes. Nodes may move, turn and scale the Gaussians, by the same factor
     along all axes.
     """
-    path = require_file(path)
-    with reading(path):
-        return _read(path, memoryview(path.read_bytes())).validate(f"{path}: Gaussians")
-
-
-def _read(path: Path, content: memoryview) -> Gaussians:
-    root, buffer = _read_chunks(path, content)
-    if others := [name for name in root.get("extensionsRequired", ()) if name != EXTENSION]:
-        raise InputError(
-            f"{path} needs the extension {others[0]}: expected no other than {EXTENSION}; write it "
-            "without compression."
+    with reading(path, "binary glTF") as path:
+        root, buffer = _read_chunks(path.read_bytes())
+        if others := {*root.get("extensionsRequired", ())} - {EXTENSION}:
+            raise InputError(f"it needs the extension {min(others)}: write it without compression.")
+        primitive, motion = _find(root)
+        splats = primitive["extensions"][EXTENSION]
+        known = all(splats.get(key, value) == value for key, value in KERNEL.items())
+        if primitive.get("mode") != POINTS or not known or splats.get("extensions"):
+            raise InputError(
+                f"its Gaussians are {splats}: expected uncompressed points of {KERNEL}."
+            )
+        attributes = primitive["attributes"]
+        degree = max(d for d in range(4) if d == 0 or _sh_names(16)[d * d] in attributes)
+        names = ["POSITION", ROTATION, SCALE, OPACITY, *_sh_names((degree + 1) ** 2)]
+        columns = [torch.from_numpy(_read_accessor(root, buffer, attributes[n])) for n in names]
+        means, quats, scales, opacities, *sh = columns
+        if not (quats != 0).any(1).all():
+            raise InputError("a rotation is 0: repair or remove that Gaussian.")
+        gaussians = Gaussians(
+            means=means,
+            quats=torch.nn.functional.normalize(quats.double(), dim=-1).float().roll(1, 1),
+            scales=torch.where(scales == 0, TINY, scales),
+            opacities=torch.where(opacities == 0, TINY, opacities)[:, 0],
+            sh=torch.stack(sh, 1),
         )
-    primitive, motion = _find(path, root)
-    kernel = primitive["extensions"][EXTENSION]
-    if kernel.get("extensions") or kernel | KERNEL != kernel:
-        raise InputError(f"{path} has Gaussians of {kernel}: expected {KERNEL}, not compressed.")
-    attributes = primitive["attributes"]
-    degree = max(d for d in range(4) if d == 0 or _sh_names(16)[d * d] in attributes)
-    names = {"POSITION": 3, ROTATION: 4, SCALE: 3, OPACITY: 1}
-    names |= dict.fromkeys(_sh_names((degree + 1) ** 2), 3)
-    means, quats, scales, opacities, *sh = (
-        torch.from_numpy(_read_accessor(path, root, buffer, attributes[name], size))
-        for name, size in names.items()
-    )
-    if not (quats != 0).any(1).all():
-        raise InputError(f"{path} has a rotation of 0: repair or remove that Gaussian.")
-    gaussians = Gaussians(
-        means=means,
-        quats=torch.nn.functional.normalize(quats.double(), dim=-1).float().roll(1, 1),
-        scales=torch.where(scales == 0, TINY, scales),
-        opacities=torch.where(opacities == 0, TINY, opacities)[:, 0],
-        sh=torch.stack(sh, 1),
-    )
-    return half_turn(_move(path, gaussians, motion), 2)
+        return half_turn(_move(gaussians, motion), 2).validate()
 
 
-def _read_chunks(path: Path, content: memoryview) -> tuple[dict[str, Any], memoryview]:
+def _read_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     """Read the JSON of a file and the bytes of its buffer."""
     magic, version, total = HEADER.unpack_from(content)
-    if magic != MAGIC or version != VERSION:
-        raise InputError(f"{path} is not binary glTF of version {VERSION}: write .glb.")
+    if magic != MAGIC or version != VERSION or total > len(content):
+        raise InputError(
+            f"{magic!r}, version {version}, {len(content)} of {total} bytes: expected binary glTF "
+            f"of version {VERSION}."
+        )
     chunks, start = {}, HEADER.size
     while start < total:
         size, kind = CHUNK.unpack_from(content, start)
         start += CHUNK.size
         chunks.setdefault(kind, content[start : start + size])
         start += size
-    return json.loads(bytes(chunks[JSON])), chunks.get(BINARY, content[:0])
+    return json.loads(chunks[JSON]), chunks[BINARY]
 
 
-def _find(path: Path, root: dict[str, Any]) -> tuple[dict[str, Any], Float[Tensor, "4 4"]]:
+def _find(root: dict[str, Any]) -> tuple[dict[str, Any], Float[Tensor, "4 4"]]:
     """Find the one primitive of Gaussians, and compute its transform to the scene."""
-    nodes, parents, found = root.get("nodes", []), {}, []
-    for index, node in enumerate(nodes):
-        parents |= dict.fromkeys(node.get("children", ()), index)
-        if "mesh" in node:
-            primitives = root["meshes"][node["mesh"]]["primitives"]
-            found += [(index, p) for p in primitives if EXTENSION in p.get("extensions", ())]
+    nodes = root.get("nodes", [])
+    parents = {c: index for index, node in enumerate(nodes) for c in node.get("children", ())}
+    found = [
+        (index, primitive)
+        for index, node in enumerate(nodes)
+        if "mesh" in node
+        for primitive in root["meshes"][node["mesh"]]["primitives"]
+        if EXTENSION in primitive.get("extensions", ())
+    ]
     if len(found) != 1:
         raise InputError(
-            f"{path} has {len(found)} primitives with {EXTENSION} in its nodes: expected one; join "
-            "them in the program that wrote it."
+            f"{len(found)} primitives with {EXTENSION} in its nodes: expected one; join them in "
+            "the program that wrote it."
         )
     ((index, primitive),) = found
-    motion = torch.eye(4, dtype=torch.float64)
-    for _ in nodes:
-        motion = _local_transform(nodes[index]) @ motion
-        if index not in parents:
-            return primitive, motion
+    motion = _local_transform(nodes[index])
+    while index in parents:
         index = parents[index]
-    raise InputError(f"{path} has a node within itself: expected a tree; write it again.")
+        motion = _local_transform(nodes[index]) @ motion
+    return primitive, motion
 
 
 def _local_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
@@ -196,38 +187,32 @@ def _local_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     return matrix
 
 
-def _move(path: Path, gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
+def _move(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
     identity = torch.eye(4, dtype=torch.float64)
     if torch.equal(motion, identity):
         return gaussians  # with all bits
     scale = motion[:3, :3].det().clamp_min(0) ** (1 / 3)
     rigid = motion.clone()
     rigid[:3, :3] /= scale
-    rotation_error = rigid[:3, :3] @ rigid[:3, :3].mT - identity[:3, :3]
-    rigid_error = torch.cat((rotation_error.flatten(), motion[3] - identity[3])).abs().max()
-    if not (rigid_error < TOLERANCE and rigid.isfinite().all()):
+    if not ((rigid[:3, :3] @ rigid[:3, :3].mT - identity[:3, :3]).abs() < TOLERANCE).all():
         raise InputError(
-            f"{path} has nodes that stretch, shear or mirror its Gaussians: expected a rotation, a "
-            "translation and one scale; apply the others in the program that wrote it."
+            "its nodes stretch, shear or mirror its Gaussians: expected a rotation, a translation "
+            "and one scale; apply the others in the program that wrote it."
         )
     return transform(gaussians.scale_by(scale.item()), rigid)
 
 
-def _read_accessor(
-    path: Path, root: dict[str, Any], buffer: memoryview, index: int, size: int
-) -> Float[ndarray, "N size"]:
+def _read_accessor(root: dict[str, Any], buffer: bytes, index: int) -> Float[ndarray, "N size"]:
     """Read the numbers of an attribute."""
     accessor = root["accessors"][index]
     view = root["bufferViews"][accessor["bufferView"]]
-    if "sparse" in accessor or "extensions" in view or accessor["type"] != KINDS[size]:
-        raise InputError(
-            f"{path} has accessor {index} of {accessor['type']}: expected {KINDS[size]}, neither "
-            "sparse nor compressed."
-        )
+    if accessor.get("sparse") or view.get("extensions") or view["buffer"]:
+        raise InputError("numbers are sparse, compressed or in another file: write them plainly.")
     dtype = np.dtype(TYPES[accessor["componentType"]])
+    shape = (accessor["count"], SIZES[accessor["type"]])
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    strides = view.get("byteStride", dtype.itemsize * size), dtype.itemsize
-    values = np.ndarray((accessor["count"], size), dtype, buffer, start, strides).astype(np.float32)
+    strides = (view.get("byteStride", dtype.itemsize * shape[1]), dtype.itemsize)
+    values = np.ndarray(shape, dtype, buffer, start, strides).astype(np.float32)
     if accessor.get("normalized") and dtype.kind != "f":
         values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
     return values

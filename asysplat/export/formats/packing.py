@@ -1,8 +1,5 @@
-"""What formats share: an order in space, packed rotations, axes, one error of damaged files."""
+"""What formats share: errors of reading, an order in space, packed rotations, and axes."""
 
-import struct
-import zipfile
-import zlib
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,13 +10,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, brief
 from asysplat.geometry.spherical_harmonics import sh_basis
 from asysplat.scene import Gaussians
 
 MORTON_BITS = 21  # of each coordinate; three fit into 64
-MAX_TEXT = 80  # characters of another error's in a message
-DAMAGE = (AttributeError, EOFError, ValueError, struct.error, zipfile.BadZipFile, zlib.error)
 GENERIC_DIRECTION = (0.36, 0.48, 0.8)  # no SH function up to degree 3 is 0 along it
 
 
@@ -98,25 +93,21 @@ TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that rou
 
 
 @contextmanager
-def reading(path: Path) -> Generator[None]:
-    """Turn any error of a file that is cut off, or of another kind, into one that names it."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (*DAMAGE, ArithmeticError, LookupError, OSError, RuntimeError, TypeError) as error:
-        raise InputError(
-            f"{path} cannot be read ({type(error).__name__}: {str(error)[:MAX_TEXT]}): it is "
-            "damaged or no file of this format; copy or write it again."
-        ) from error
+def reading(path: str | Path, kind: str) -> Generator[Path]:
+    """Yield the path of a file; errors inside become a sentence that begins with it.
 
-
-def require_file(path: str | Path) -> Path:
-    """Check that a file exists and return its path; raise InputError if there is none."""
+    A file that is cut short makes its reader raise anything.
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file: name an existing one.")
-    return path
+    try:
+        yield path
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:
+        reason = f"{path} cannot be read as {kind} ({brief(error)})"
+        raise InputError(f"{reason}: it is cut short or of another format.") from error
 
 
 def prepare_for_export(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:

@@ -7,7 +7,6 @@ PLY's axes. Pixel i of each image belongs to Gaussian i.
 import json
 import math
 import zipfile
-from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
 from PIL import Image
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -26,7 +26,6 @@ from asysplat.export.formats.packing import (
     join_largest,
     prepare_for_export,
     reading,
-    require_file,
     split_largest,
 )
 from asysplat.files import atomic_write
@@ -220,68 +219,61 @@ def _k_means(
 
 def read_sog(path: str | Path) -> Gaussians:
     """Read one scene from a SOG bundle of version 2."""
-    path = require_file(path)
-    with reading(path), zipfile.ZipFile(path) as archive:
-        meta = _read_meta(path, archive)
+    with reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
+        meta = _read_meta(archive)
         count = meta["count"]
-
-        def images(name: str) -> Iterator[UInt8[Tensor, "N 4"]]:
-            return (_image(archive, file).flatten(0, 1)[:count] for file in meta[name]["files"])
-
-        low, high = (torch.tensor(meta["means"][key]).double() for key in ("mins", "maxs"))
-        fine, coarse = images("means")
-        (rotations,), (sizes,), (rgba,) = map(images, ("quats", "scales", "sh0"))
-        sh = [_decode(meta["sh0"], rgba[:, None, :3])]
-        if "shN" in meta:
-            sh.append(_read_palette(archive, meta["shN"], count))
+        (low, high) = (torch.tensor(meta["means"][key]).double() for key in ("mins", "maxs"))
+        fine, coarse, rotations, scales, colors = (
+            image.flatten(0, 1)[:count]
+            for name in ("means", "quats", "scales", "sh0")
+            for image in _images(archive, meta[name])
+        )
         fixed = coarse[:, :3].int() << 8 | fine[:, :3]
         logs = low + (high - low) * fixed / 65535
-        gaussians = Gaussians(
+        sh = [_decode(meta["sh0"], colors[:, None, :3])]
+        if "shN" in meta:
+            sh.append(_read_palette(archive, meta["shN"], count))
+        return Gaussians(
             means=(logs.sign() * logs.abs().expm1()).float(),
-            quats=_quats(rotations),
-            scales=_decode(meta["scales"], sizes[:, :3]).exp().clamp_min(TINY),
-            opacities=(rgba[:, 3] / 255).clamp_min(TINY),
+            quats=_quats(rotations.numpy()),
+            scales=_decode(meta["scales"], scales[:, :3]).exp().clamp_min(TINY),
+            opacities=(colors[:, 3] / 255).clamp_min(TINY),
             sh=torch.cat(sh, 1),
-        )
-        return gaussians.validate(f"{path}: Gaussians")
+        ).validate()
 
 
 def is_antialiased(path: Path) -> bool:
     """Read whether a file is to be rendered with `antialiased`."""
-    with reading(path), zipfile.ZipFile(path) as archive:
-        return _read_meta(path, archive).get("antialias") is True
+    with reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
+        return _read_meta(archive).get("antialias", False)
 
 
-def _read_meta(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+def _read_meta(archive: zipfile.ZipFile) -> dict[str, Any]:
     meta = json.loads(archive.read("meta.json"))
     if meta["version"] != VERSION:
-        raise InputError(f"{path} has SOG's version {meta['version']}: expected {VERSION}.")
+        raise InputError(f"it has version {meta['version']} of SOG: expected {VERSION}.")
     return meta
 
 
-def _decode(record: dict[str, Any], codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+def _images(archive: zipfile.ZipFile, record: dict) -> list[UInt8[Tensor, "height width 4"]]:
+    """Read a record's images, in RGBA."""
+    files = (BytesIO(archive.read(name)) for name in record["files"])
+    images = (Image.open(file, formats=("WEBP",)).convert("RGBA") for file in files)
+    return [torch.from_numpy(np.array(image)) for image in images]
+
+
+def _decode(record: dict, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.tensor(record["codebook"], dtype=torch.float32)[codes.int()]
 
 
-def _quats(rotations: UInt8[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    tags = rotations[:, 3].numpy().astype(np.int64) - FIRST_TAG
-    if (tags < 0).any():
-        raise ValueError(f"a rotation has an alpha below {FIRST_TAG}")
-    rest = (rotations[:, :3].numpy() / 127.5 - 1) / math.sqrt(2)
-    return join_largest(tags, rest).float()
+def _quats(rotations: UInt8[ndarray, "N 4"]) -> Float[Tensor, "N 4"]:
+    largest = rotations[:, 3].astype(np.int64) - FIRST_TAG
+    return join_largest(largest, (rotations[:, :3] / 127.5 - 1) / math.sqrt(2)).float()
 
 
-def _read_palette(
-    archive: zipfile.ZipFile, record: dict[str, Any], count: int
-) -> Float[Tensor, "N terms 3"]:
+def _read_palette(archive: zipfile.ZipFile, record: dict, count: int) -> Float[Tensor, "N terms 3"]:
     """Read the SH of degree 1 and above."""
     terms = record["bands"] * (record["bands"] + 2)
-    centroids, labels = (_image(archive, file) for file in record["files"])
+    centroids, labels = _images(archive, record)
     low, high = labels.flatten(0, 1)[:count, :2].long().unbind(1)
-    palette = centroids[..., :3].reshape(-1, terms, 3)[: record["count"]]
-    return _decode(record, palette)[low | high << 8]
-
-
-def _image(archive: zipfile.ZipFile, name: str) -> UInt8[Tensor, "height width 4"]:
-    image = Image.open(BytesIO(archive.read(name)), formats=("WEBP",))
-    return torch.from_numpy(np.array(image.convert("RGBA")))
+    return _decode(record, centroids[..., :3].reshape(-1, terms, 3)[low | high << 8])

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.formats.packing import TINY, prepare_for_export, require_file
+from asysplat.export.formats.packing import TINY, prepare_for_export, reading
 from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
@@ -20,25 +20,18 @@ def read_splat(path: str | Path) -> Gaussians:
     Scales are stored as they are, alpha is the opacity, rotations are (v - 128) / 128, wxyz.
     Format: https://github.com/antimatter15/splat
     """
-    path = require_file(path)
-    size = path.stat().st_size
-    if size == 0 or size % ROW.itemsize:
-        raise InputError(
-            f"{path} has {size} bytes: expected a multiple of {ROW.itemsize}, so it is cut off or "
-            "no .splat file; copy it again."
-        )
-    rows = np.fromfile(path, ROW)
-    if not (rows["quat"] != 128).any(1).all():
-        raise InputError(f"{path} has a rotation of 0: repair or remove that Gaussian.")
-    rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
-    gaussians = Gaussians(
-        means=torch.tensor(rows["mean"]),
-        quats=(torch.tensor(rows["quat"], dtype=torch.float32) - 128) / 128,
-        scales=torch.tensor(rows["scale"]).clamp_min(TINY),
-        opacities=rgba[:, 3].clamp_min(TINY),
-        sh=(rgba[:, None, :3] - 0.5) / SH_C0,
-    )
-    return gaussians.validate(f"{path}: Gaussians")
+    with reading(path, ".splat") as file:
+        rows = np.frombuffer(file.read_bytes(), ROW)
+        if not len(rows) or not (rows["quat"] != 128).any(1).all():
+            raise InputError("no Gaussian, or one with a rotation of 0: write it again.")
+        rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
+        return Gaussians(
+            means=torch.tensor(rows["mean"]),
+            quats=(torch.tensor(rows["quat"], dtype=torch.float32) - 128) / 128,
+            scales=torch.tensor(rows["scale"]).clamp_min(TINY),
+            opacities=rgba[:, 3].clamp_min(TINY),
+            sh=(rgba[:, None, :3] - 0.5) / SH_C0,
+        ).validate()
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:

@@ -7,7 +7,7 @@ import gzip
 import io
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -26,7 +26,6 @@ from asysplat.export.formats.packing import (
     join_largest,
     prepare_for_export,
     reading,
-    require_file,
     split_largest,
 )
 from asysplat.files import atomic_write
@@ -155,42 +154,55 @@ def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UIn
 
 def read_spz(path: str | Path) -> Gaussians:
     """Read one scene from SPZ, version 2, 3 or 4; SH of degree 4 are left out."""
-    path = require_file(path)
-    with reading(path):
-        return _read(path, path.read_bytes()).validate(f"{path}: Gaussians")
-
-
-def _read(path: Path, content: bytes) -> Gaussians:
-    header, streams = (_read_4 if content[:4] == MAGIC else _read_gzip)(path, content)
-    positions, alphas, colors, scales, rotations, sh = (
-        np.frombuffer(stream, np.uint8).reshape(header.count, -1)
-        if stream
-        else np.zeros((header.count, 0), np.uint8)
-        for stream in streams
-    )
-    fixed = np.zeros((header.count, 3, 4), np.uint8)
-    fixed[..., 1:] = positions.reshape(-1, 3, 3)  # the sign stands in the highest byte
-    means = (fixed.view("<i4")[..., 0] >> 8) * 2.0**-header.fraction_bits
-    rest_count = min(header.degree + 1, 4) ** 2 - 1
-    rest = (sh.reshape(header.count, -1, 3)[:, :rest_count].astype(np.float32) - 128) / 128
-    color = (colors[:, None] / np.float32(255) - 0.5) / COLOR_FACTOR
-    gaussians = Gaussians(
-        means=torch.from_numpy(means).float(),
-        quats=_quats(rotations).roll(1, 1).float(),
-        scales=torch.from_numpy(np.exp(scales / np.float32(16) - 10)),
-        opacities=torch.from_numpy(alphas[:, 0] / np.float32(255)).clamp_min(TINY),
-        sh=torch.from_numpy(np.concatenate((color, rest), 1)),
-    )
-    return half_turn(gaussians, 0)
+    with reading(path, "SPZ") as path:
+        header, streams = _read_streams(path.read_bytes())
+        count = header.count
+        positions, alphas, colors, scales, rotations, sh = (
+            np.frombuffer(stream, np.uint8).reshape(count, size // count)
+            for stream, size in zip(streams, header.sizes(), strict=True)
+        )
+        fixed = np.zeros((count, 3, 4), np.uint8)
+        fixed[..., 1:] = positions.reshape(-1, 3, 3)  # the sign stands in the highest byte
+        means = (fixed.view("<i4")[..., 0] >> 8) * 2.0**-header.fraction_bits
+        rest_count = min(header.degree + 1, 4) ** 2 - 1
+        rest = (sh.reshape(count, -1, 3)[:, :rest_count].astype(np.float32) - 128) / 128
+        color = (colors[:, None] / np.float32(255) - 0.5) / COLOR_FACTOR
+        gaussians = Gaussians(
+            means=torch.from_numpy(means).float(),
+            quats=_quats(rotations).roll(1, 1).float(),
+            scales=torch.from_numpy(np.exp(scales / np.float32(16) - 10)),
+            opacities=torch.from_numpy(alphas[:, 0] / np.float32(255)).clamp_min(TINY),
+            sh=torch.from_numpy(np.concatenate((color, rest), 1)),
+        )
+        return half_turn(gaussians, 0).validate()
 
 
 def is_antialiased(path: Path) -> bool:
     """Read whether a file is to be rendered with `antialiased`."""
-    with reading(path), open(path, "rb") as file:
-        version_4 = file.read(4) == MAGIC
-        file.seek(0)
-        stream = file if version_4 else gzip.GzipFile(fileobj=file)
-        return _header(path, _take(stream.read, HEADER.size))[0].antialiased
+    with reading(path, "SPZ") as path, open(path, "rb") as file:
+        start = file.read(HEADER.size)
+        if not start.startswith(MAGIC):
+            file.seek(0)
+            start = gzip.GzipFile(fileobj=file).read(HEADER.size)
+        return _header(start).antialiased
+
+
+def _read_streams(content: bytes) -> tuple[Header, list[bytes]]:
+    """Unpack the header, and the bytes of positions, alphas, colors, scales, rotations and SH."""
+    if not content.startswith(MAGIC):  # versions 2 and 3: all in one gzip stream
+        unpacked = io.BytesIO(gzip.decompress(content))
+        header = _header(unpacked.read(HEADER.size))
+        return header, [unpacked.read(size) for size in header.sizes()]
+    header, streams = _header(content), []
+    (table,) = struct.unpack_from("<I", content, HEADER.size)
+    stored = [size for size in header.sizes() if size]
+    start = table + TABLE.size * len(stored)
+    for index, size in enumerate(stored):
+        packed, _ = TABLE.unpack_from(content, table + TABLE.size * index)
+        decompressor = _zstandard().ZstdDecompressor()
+        streams.append(decompressor.decompress(content[start : start + packed], size))
+        start += packed
+    return header, streams + [b""] * (len(header.sizes()) - len(stored))
 
 
 def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
@@ -205,45 +217,15 @@ def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
     return join_largest((packed[:, 0] >> 30).astype(np.int64), rest)
 
 
-def _read_gzip(path: Path, content: bytes) -> tuple[Header, list[bytes]]:
-    """Read versions 2 and 3: header and all streams in one gzip stream."""
-    unpacked = gzip.GzipFile(fileobj=io.BytesIO(content))
-    header, _ = _header(path, _take(unpacked.read, HEADER.size))
-    return header, [_take(unpacked.read, size) for size in header.sizes()]
-
-
-def _read_4(path: Path, content: bytes) -> tuple[Header, list[bytes]]:
-    """Read version 4: a header, a table of streams, and each stream in Zstandard."""
-    file = io.BytesIO(content)
-    header, count = _header(path, _take(file.read, HEADER.size))
-    sizes = header.sizes()
-    (start,) = struct.unpack("<I", _take(file.read, 4))
-    file.seek(start)
-    table = [TABLE.unpack(_take(file.read, TABLE.size)) for _ in range(count)]
-    zstandard, streams = _zstandard(), []
-    for (packed, _), size in zip(table, sizes, strict=False):
-        unpacked = zstandard.ZstdDecompressor().stream_reader(_take(file.read, packed))
-        try:
-            streams.append(_take(unpacked.read, size))
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
-    return header, streams + [b""] * (len(sizes) - count)
-
-
-def _take(read: Callable[[int], bytes], size: int) -> bytes:
-    """Read exactly `size` bytes."""
-    data = read(size)
-    if len(data) < size:
-        raise EOFError(f"{size} bytes were expected where {len(data)} follow")
-    return data
-
-
-def _header(path: Path, content: bytes) -> tuple[Header, int]:
-    """Read a header, and the number of streams, which versions 2 and 3 do not use."""
-    magic, version, count, degree, fraction_bits, flags, streams = HEADER.unpack(content)
-    if magic != MAGIC or not 2 <= version <= 4:
-        raise InputError(f"{path} is not an SPZ file of version 2 to 4: write one of these.")
-    return Header(version, count, degree, fraction_bits, bool(flags & ANTIALIASED)), streams
+def _header(content: bytes) -> Header:
+    magic, *numbers, flags, _ = HEADER.unpack_from(content)
+    header = Header(*numbers, bool(flags & ANTIALIASED))
+    if magic != MAGIC or header.version not in (2, 3, 4) or not header.count:
+        raise InputError(
+            f"{magic!r} of version {header.version} with {header.count} Gaussians: expected "
+            f"{MAGIC!r}, version 2 to 4, and one or more."
+        )
+    return header
 
 
 def _zstandard() -> ModuleType:
