@@ -131,10 +131,11 @@ def open_photographs(
     if not found:
         selected = sorted((*inputs, *held_out))
         part = replace(scene, images=[scene.images[index] for index in selected])
-        part = refine_given(part, cameras, say)
+        part, matched = refine_given(part, cameras, say)
         images = dict(enumerate(scene.images)) | dict(zip(selected, part.images, strict=True))
         scene = replace(part, images=list(images.values()))
-    _warn_of_wrong_cameras(scene, say)
+        if not matched:
+            _warn_of_wrong_cameras(scene, say)
     sequence = FileSequence(scene, SceneOptions(height, width))
     both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
     input_views, targets, normalization = normalize(*both)

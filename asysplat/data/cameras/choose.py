@@ -16,6 +16,9 @@ from asysplat.errors import InputError
 
 CHOICES = ("auto", "given", "refined", "found")
 LEAST_GAIN = 0.01  # fraction of the reprojection error; refined cameras that gain less are not used
+# Features for each match, from which on given cameras are near the truth: 0.35 to 0.6 of good ones,
+# below 0.2 if axes, order, focal length or direction of the matrices are wrong.
+LEAST_FEATURES = 0.25
 
 
 @dataclass(frozen=True)
@@ -53,23 +56,27 @@ def find_missing(
 
 def refine_given(
     scene: PosedScene, options: CameraOptions, say: Callable[[str], None]
-) -> PosedScene:
-    """Return a scene with refined cameras, if they are wanted, or better and "auto"."""
+) -> tuple[PosedScene, bool]:
+    """Return a scene with refined cameras, if they are wanted, or better and "auto".
+
+    And whether so many features agree with the given cameras that these are not wrong.
+    """
     if options.choice not in ("auto", "refined"):
-        return scene
+        return scene, False
     images = [image for image in scene.images if image.lens.model != PANORAMA]
     files = {image.file for image in images if isinstance(image.file, Path)}
     if len(files) < len(scene.images):
         say("cameras: as given; panoramas and images inside other files are not refined.")
-        return scene
+        return scene, False
     result = refine_cameras(scene, options.where, options.console)
     if not result.features:
         say("cameras: as given; too few features match to refine them.")
-        return scene
+        return scene, False
     refined = options.choice == "refined" or result.after < (1 - LEAST_GAIN) * result.before
     say(
         f"cameras: {'refined' if refined else 'as given'} (cameras=); {result.features:,} features "
         f"are {result.before:.2f} px from their points with the given cameras, and "
         f"{result.after:.2f} px with refined ones"
     )
-    return result.scene if refined else scene
+    agree = result.features > LEAST_FEATURES * result.matched
+    return result.scene if refined else scene, agree

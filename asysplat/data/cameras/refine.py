@@ -44,12 +44,14 @@ class RefinedCameras:
         scene: scene with the refined cameras.
         before, after: mean distances of the points' projections from their features, in pixels.
         features: number of these features; with none the cameras are as they were.
+        matched: number of matches between photographs, which no camera has a part in.
     """
 
     scene: PosedScene
     before: float
     after: float
     features: int
+    matched: int
 
 
 def refine_cameras(
@@ -73,7 +75,7 @@ def refine_cameras(
     names = colmap_names(images)
     cameras = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
-    method = f"{USUAL} {LEAST_OF_LENS} {cameras}"
+    method = f"matched {USUAL} {LEAST_OF_LENS} {cameras}"
     folder = where / f"{scene.name}-refined-{digest(method, [*images, *masks])}"
     if not folder.is_dir():
         with work_folder(where, len(images), console) as (work, progress):
@@ -116,6 +118,8 @@ def _refine(
     # With more threads, sums vary in their last bits.
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=1)
     errors = {"before": 0.0, "after": 0.0, "features": 0}
+    with pycolmap.Database.open(database) as stored:
+        matched = stored.num_inlier_matches()
     for number in range(ROUNDS):
         model = pycolmap.triangulate_points(model, database, work / "images", work, True, options)
         progress.advance(task)
@@ -129,7 +133,7 @@ def _refine(
             errors = {"before": before, "after": model.compute_mean_reprojection_error()}
             errors["features"] = model.compute_num_observations()
     _move_back(model, poses)
-    (work / ERRORS).write_text(json.dumps(errors))
+    (work / ERRORS).write_text(json.dumps(errors | {"matched": matched}))
     return model
 
 

@@ -10,6 +10,7 @@ import torch
 
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.cameras import CameraOptions, refine_cameras, refine_given
+from asysplat.data.cameras.choose import LEAST_FEATURES
 from asysplat.data.cameras.refine import LEAST_OF_LENS, LEAST_POINTS
 from asysplat.data.photographs import open_photographs
 from asysplat.data.write import write_transforms
@@ -79,6 +80,7 @@ def test_they_are_nearer_to_the_truth_and_in_the_given_world(views, folder, trut
     before, after = (pose_errors(scene, truth) for scene in (given, new))
     assert after[1] < before[1] and after[1] < 0.01
     assert refined[1].after < 0.7 * refined[1].before and refined[1].features > 1000
+    assert refined[1].features > LEAST_FEATURES * refined[1].matched
     assert [image.file for image in new.images] == [image.file for image in given.images]
     # The points are surfaces of the true scene.
     depths = new.points @ np.linalg.inv(truth[0])[2, :3] + np.linalg.inv(truth[0])[2, 3]
@@ -138,8 +140,8 @@ def test_photographs_without_features_keep_their_cameras(views, tmp_path):
     write_transforms(black, tmp_path / "black")
     scene, said = read(tmp_path / "black"), []
     assert refine_cameras(scene, tmp_path / "logs").features == 0
-    kept = refine_given(scene, CameraOptions("auto", tmp_path / "logs"), said.append)
-    assert kept is scene and "too few features match" in said[0]
+    kept, matched = refine_given(scene, CameraOptions("auto", tmp_path / "logs"), said.append)
+    assert kept is scene and not matched and "too few features match" in said[0]
 
 
 @pytest.mark.medium
@@ -176,6 +178,12 @@ def test_which_cameras_are_used(views, folder, tmp_path):
     write_transforms(views, exact)
     fx, said = opened("auto", exact)
     assert fx == pytest.approx(focal, rel=1e-6) and said[0].startswith("cameras: as given")
+    # Features are matched once, and again only if those that agree with the cameras are few.
+    assert len(said) == 1
+    poses = views.cameras.cam_to_world * torch.tensor([1.0, -1, -1, 1])
+    turned = Views(replace(views.cameras, cam_to_world=poses), views.images)
+    write_transforms(turned, tmp_path / "turned")
+    assert any("OpenGL axes" in sentence for sentence in opened("auto", tmp_path / "turned")[1])
 
 
 def test_an_unknown_choice():

@@ -174,7 +174,7 @@ def test_the_check_does_not_take_faces_for_copies(scene):
 def test_cameras_of_panoramas_stay_as_given(scene):
     said, posed = [], opened(scene).scene
     one = PosedScene("faces of three panoramas", posed.images[:3])
-    assert refine_given(one, CameraOptions("refined"), said.append) is one
+    assert refine_given(one, CameraOptions("refined"), said.append) == (one, False)
     assert "cameras: as given; panoramas" in said[0]
 
 
