@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from typing import Literal, TypeVar, TypeVarTuple
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, brief
 
 Policy = Literal["fail", "skip"]
 MIN_IMAGES = 2  # in a scene
@@ -28,20 +28,22 @@ class BadImages:
         self.errors: list[str] = []
 
     @contextmanager
-    def collect(self) -> Generator[None]:
-        """Collect an InputError that is raised inside, and go on after the block."""
+    def collect(self, name: str = "an image") -> Generator[None]:
+        """Collect an error of a file that is raised inside, and go on after the block."""
         try:
             yield
         except InputError as error:
             self.errors.append(str(error))
+        except (LookupError, TypeError, ValueError) as error:  # of a file that lacks something
+            self.errors.append(f"{name} cannot be read ({brief(error)}).")
 
     def read_each(
         self, read: Callable[[*Item], Result], items: Iterable[tuple[*Item]]
     ) -> list[Result]:
         """Return `read(*item)` of every item that can be read, and collect the other errors."""
         results = []
-        for item in items:
-            with self.collect():
+        for index, item in enumerate(items):
+            with self.collect(f"image {index}"):
                 results.append(read(*item))
         return results
 

@@ -142,7 +142,7 @@ def test_cameras_that_do_not_fit_the_images_are_refused(file, sequence, other):
         ([*poses, *((f"more/{n}", p) for n, p in poses)], "has 0 of the 12 images of room"),
         ([(name, np.eye(4)) for name in names], "in one place or none: give cameras of two or"),
         ([(name, pose * [-1, 1, 1, 1]) for name, pose in poses], "is not a rotation"),
-        ([(7, matrices[0])], "has no file_path"),
+        ([(names[0], matrices[0][:2])], "is not 4x4"),
     ):
         write_json(file, given)
         with pytest.raises(InputError, match=message) as raised:

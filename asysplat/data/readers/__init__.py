@@ -13,8 +13,6 @@ tests/data/readers/layouts/NAME.py. A data set in a known layout needs no code: 
 conf/data/mipnerf360.yaml.
 """
 
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -34,12 +32,11 @@ from asysplat.data.readers import (
     transforms,
 )
 from asysplat.data.readers.additions import with_faces, with_masks
-from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
+from asysplat.data.readers.common import SUFFIXES, file_errors, images_in, natural_order
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.files import check_exists
 
-MAX_NAME = 200  # characters of a path in a message
 # In this order: the first layout that fits a folder reads it.
 READERS = (
     *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap),
@@ -48,25 +45,12 @@ READERS = (
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 
 
-@contextmanager
-def _file_errors(path: Path) -> Generator[None]:
-    """Raise an InputError for a path that the system refuses: too long, unreadable, a loop."""
-    try:
-        yield
-    except OSError as error:
-        name = str(error.filename or path)
-        raise InputError(
-            f"{name[:MAX_NAME]}{'...' * (len(name) > MAX_NAME)} cannot be read ({error.strerror}): "
-            f"repair the files of {path}."
-        ) from error
-
-
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
     """Return the layout of the scenes that `root` is or holds, and the scenes."""
     _check_layout(layout)
     root = Path(root).absolute()
     for name in LAYOUTS if layout == "auto" else (layout,):
-        with _file_errors(root):
+        with file_errors(root):
             scenes = LAYOUTS[name].find_scenes(root)
         if scenes:
             return name, scenes
@@ -92,7 +76,7 @@ def _check_layout(layout: str) -> None:
 def without_cameras(root: Path | str) -> str | None:
     """Describe photographs or a video without camera poses; None where nothing is, or poses are."""
     root = Path(root).absolute()
-    with _file_errors(root):
+    with file_errors(root):
         posed = any(reader.find_scenes(root) for reader in READERS)
     return None if posed else _bare(root)
 
@@ -114,7 +98,7 @@ def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
 
     Errors of single images are collected.
     """
-    with _file_errors(scene):
+    with file_errors(scene):
         return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad), bad)
 
 

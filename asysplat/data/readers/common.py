@@ -6,6 +6,8 @@ does not pass a check raises an InputError.
 
 import os
 import re
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,24 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.images import HEIF, Lens, image_size, same_proportions
-from asysplat.errors import InputError
+from asysplat.errors import InputError, brief
 from asysplat.files import read_json
 from asysplat.scene import MAX_FIELD_OF_VIEW, ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg", *HEIF)
-MAX_NUMBER = 1e300
-MAX_POSITION = 1e18  # float32 can hold its square
-MAX_FOCAL, MAX_CENTER = 1000.0, 100.0  # in longer sides of the image
-MAX_DISTORTION = 1e3  # coefficients
 MILLIMETERS = 0.001  # meters: the usual unit of stored depths
+
+
+@contextmanager
+def file_errors(path: Path) -> Generator[None]:
+    """Raise an InputError for files that lack something, or that the system refuses."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({brief(error)}): repair its files.") from error
 
 
 def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:
@@ -49,7 +58,7 @@ def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:
 def natural_order(path: Path) -> list[str | int]:
     """Return a sort key by the numbers in the path: 2 before 10."""
     parts = re.split(r"([0-9]+)", path.as_posix())
-    return [int(part) if part.isdecimal() else part for part in parts]
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)]
 
 
 def read_frames(file: Path) -> dict[str, Any]:
@@ -60,24 +69,9 @@ def read_frames(file: Path) -> dict[str, Any]:
     return content
 
 
-def has_path(entry: object) -> bool:
-    """Check whether an entry of "frames" names an image file."""
-    return isinstance(entry, dict) and isinstance(entry.get("file_path"), str)
-
-
-def frame_label(file: Path, index: int, entry: Any) -> str:
+def frame_label(file: Path, index: int, entry: dict[str, Any]) -> str:
     """Return the name of an entry of "frames" for messages."""
-    if not has_path(entry):
-        raise InputError(f"{file}, frame {index} has no file_path: name its image.")
     return f"{file}, frame {index} ({entry['file_path']})"
-
-
-def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return the number under `key`, or `default` where there is none."""
-    value = settings.get(key, default)
-    if not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-        raise InputError(f"{where}: {key} is {repr(value)[:80]}: give a finite number.")
-    return float(value)
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -89,18 +83,11 @@ def images_in(folder: Path) -> list[Path]:
 
 def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     """Scale a lens to an image of another size and the same field of view."""
-    # Integers from JSON may be too large for a float.
-    (width, height), lens_size = size, (min(lens.width, 10**9), min(lens.height, 10**9))
-    numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(lens_size)
-    usable = longest < MAX_FIELD_OF_VIEW * min(lens.fx, lens.fy)
-    usable &= max(lens.fx, lens.fy) < MAX_FOCAL * longest
-    usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
-    if not (usable and all(abs(number) < MAX_DISTORTION for number in lens.distortion)):
-        values = ", ".join(f"{min(number, MAX_NUMBER):g}" for number in numbers)
+    (width, height), lens_size = size, (lens.width, lens.height)
+    if not max(lens_size) < MAX_FIELD_OF_VIEW * min(lens.fx, lens.fy):
         raise InputError(
-            f"{where} has intrinsics {values}: give focal lengths in pixels, of "
-            f"1/{MAX_FIELD_OF_VIEW} to {MAX_FOCAL:g} image sides, a principal point within "
-            f"{MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
+            f"{where} has focal lengths {lens.fx:g} and {lens.fy:g}: expected pixels, at least "
+            f"1/{MAX_FIELD_OF_VIEW} of the image's sides."
         )
     # To a pixel of the smaller one, whose size was rounded.
     if min(lens_size) < 1 or not same_proportions(*sorted((size, lens_size))):
@@ -135,24 +122,11 @@ def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
     return path
 
 
-def to_array(stored: object) -> Float[ndarray, "..."]:
-    """Convert nested lists to float64; empty where they are no numbers or ragged."""
-    try:
-        return np.array(stored, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
-
-
 def check_rigid(stored: object, where: str) -> Float[ndarray, "4 4"]:
     """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
-    matrix = to_array(stored)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{where} is not 4x4: give four rows of four numbers.")
-    if not (np.abs(matrix) < MAX_POSITION).all():
-        raise InputError(
-            f"{where} holds NaN, infinity or a number above {MAX_POSITION:g}: remove this image or "
-            "repair its pose."
-        )
+    matrix = np.array(stored, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{where} is not 4x4 or holds NaN: repair it, or leave its image out.")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > ORTHONORMAL_TOLERANCE:
         raise InputError(f"{where} has last row {matrix[3].tolist()}: it must be 0 0 0 1.")
     rotation = matrix[:3, :3]

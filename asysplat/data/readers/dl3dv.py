@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.readers.common import folders_with, has_path, read_frames
+from asysplat.data.readers.common import folders_with, read_frames
 from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
@@ -52,8 +52,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     # The images lie in `images`, whatever folder the file names.
     frames = [
         {**entry, "file_path": f"{images}/{Path(entry['file_path']).name}"}
-        if has_path(entry)
-        else entry
         for entry in content["frames"]
     ]
     posed = read_images({**content, "frames": frames}, file, bad, resized=True)

@@ -12,7 +12,6 @@ from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
 from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.sequence import PosedImage, PosedScene
-from asysplat.errors import InputError
 from asysplat.files import read_text
 
 CAMERAS = "opencv_cameras.json"
@@ -45,16 +44,9 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         where = common.frame_label(file, index, entry)
         image = file.parent / entry["file_path"]
         size = image_size(image)
-        pose = common.invert_pose(common.check_rigid(entry.get("w2c"), f"{where}: w2c"))
-        try:
-            width, height = round(entry["w"]), round(entry["h"])
-            fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(
-                f"{where} needs the numbers w, h, fx, fy, cx and cy in pixels: one is missing or "
-                f"not a number ({error!r})."
-            ) from error
-        lens = Lens(width, height, fx, fy, cx, cy)
+        pose = common.invert_pose(common.check_rigid(entry["w2c"], f"{where}: w2c"))
+        fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
+        lens = Lens(round(entry["w"]), round(entry["h"]), fx, fy, cx, cy)
         return PosedImage(image, common.scale_lens(lens, size, where), pose)
 
     images = bad.read_each(read, enumerate(common.read_frames(file)["frames"]))

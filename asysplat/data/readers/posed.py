@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
@@ -23,7 +21,6 @@ from asysplat.data.readers.common import (
 )
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
-from asysplat.files import read_text
 
 POSES = ("poses_refined.txt", "poses.txt")  # the first file that exists is read
 
@@ -43,15 +40,8 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     millimeters along z, 0 where unknown.
     """
     file = next((scene / name for name in POSES if (scene / name).is_file()), scene / POSES[-1])
-    poses, images = _read_numbers(file, 16), images_in(scene / "images")
-    matrix = _read_numbers(scene / "K.txt", 3)
-    zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]] if len(matrix) == 3 else matrix
-    if len(matrix) != 3 or zeros.any() or matrix[2, 2] != 1:
-        raise InputError(
-            f"{scene / 'K.txt'} holds {matrix.tolist()}: expected the pinhole matrix "
-            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels."
-        )
-    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    poses, images = np.loadtxt(file, ndmin=2), images_in(scene / "images")
+    (fx, _, cx), (_, fy, cy), _ = np.loadtxt(scene / "K.txt").tolist()
     depths = scene / "depth"
     if len(poses) != len(images):
         raise InputError(
@@ -75,18 +65,3 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     posed = bad.read_each(read, enumerate(images))
     return PosedScene(scene.name, posed, partial(read_model_points, scene, posed))
-
-
-def _read_numbers(file: Path, columns: int) -> Float[ndarray, "rows columns"]:
-    try:
-        lines = [line.split() for line in read_text(file).splitlines()]
-        rows = [[float(number) for number in line] for line in lines if line]
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read as numbers ({error}): write it again.") from error
-    for index, row in enumerate(rows):
-        if len(row) != columns:
-            raise InputError(
-                f"{file}, row {index} holds {len(row)} numbers: expected {columns}: write the file "
-                "again, it may be cut short."
-            )
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)

@@ -119,26 +119,24 @@ def _transforms(
     has_depths = depths and (folder / depths).is_dir()
     frames = []
     for entry in _good_frames(content, file, folder / images):
-        if common.has_path(entry):
-            name = f"{Path(entry['file_path']).stem}.png"
-            entry = {
-                **entry,
-                "file_path": f"{images}/{entry['file_path']}",
-                "mask_path": f"{masks}/{name}" if has_masks else None,
-                "depth_file_path": f"{depths}/{name}" if has_depths else None,
-            }
-        frames.append(entry)
+        name = f"{Path(entry['file_path']).stem}.png"
+        paths = {
+            "file_path": f"{images}/{entry['file_path']}",
+            "mask_path": f"{masks}/{name}" if has_masks else None,
+            "depth_file_path": f"{depths}/{name}" if has_depths else None,
+        }
+        frames.append({**entry, **paths})
     posed = read_images({**content, "frames": frames}, file, bad, folder)
     return [replace(image, cam_to_world=TURN @ image.cam_to_world) for image in posed]
 
 
 def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
     """Return training entries and published test entries that are not marked as bad."""
-    test = [entry for entry in content.get("test_frames", []) if isinstance(entry, dict)]
-    if not any((images / str(entry.get("file_path"))).is_file() for entry in test):
+    test = content.get("test_frames", [])
+    if not any((images / entry["file_path"]).is_file() for entry in test):
         test = []  # hidden ones, or the DSLR's in the iPhone's file
     frames = content["frames"] + test
-    good = [entry for entry in frames if not (isinstance(entry, dict) and entry.get("is_bad"))]
+    good = [entry for entry in frames if not entry.get("is_bad")]
     if len(good) < len(frames):
         warnings.warn(
             f"{file}: left out {len(frames) - len(good)} of {len(frames)} images that the data set "
@@ -153,28 +151,18 @@ def _arkit(
 ) -> list[PosedImage]:
     """Read ARKit's poses, by image: camera-to-world with OpenCV axes and intrinsics in pixels."""
     content = read_json(file)
-    if not isinstance(content, dict):
-        raise InputError(f"{file} is no object of frames by name: download it again.")
     mask_folder, depth_folder = (
         folder / name if (folder / name).is_dir() else None for name in (masks, depths)
     )
 
-    def read(name: str, entry: object) -> PosedImage:
-        where = f"{file}, {name}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
-        image = folder / images / f"{name}.jpg"
+    def read(name: str, entry: dict[str, Any]) -> PosedImage:
+        where, image = f"{file}, {name}", folder / images / f"{name}.jpg"
         size = image_size(image)
-        stored = entry.get("intrinsic")
-        matrix = common.to_array(stored)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
-            raise InputError(
-                f"{where}: intrinsic is {stored}: give 3x3 numbers, fx and fy above 0, in pixels."
-            )
+        (fx, _, cx), (_, fy, cy), _ = np.array(entry["intrinsic"], np.float64).tolist()
         return PosedImage(
             file=image,
-            lens=Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
-            cam_to_world=common.check_rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
+            lens=common.scale_lens(Lens(*size, fx, fy, cx, cy), size, where),
+            cam_to_world=common.check_rigid(entry["aligned_pose"], f"{where}: aligned_pose"),
             depth=depth_folder and common.check_map_size(depth_folder / f"{name}.png", size, where),
             depth_unit=common.MILLIMETERS,
             mask=mask_folder and common.check_map_size(mask_folder / f"{name}.png", size, where),
@@ -187,9 +175,7 @@ def _points(file: Path) -> Points | None:
     """Read columns 2 to 4 of COLMAP's points3D.txt, https://colmap.github.io/format.html."""
     if not file.is_file():
         return None
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        rows = [line.split(maxsplit=4)[1:4] for line in lines if line[:1] not in ("#", "\n")]
     try:
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return np.loadtxt(file, usecols=(1, 2, 3), ndmin=2)
     except ValueError as error:
         raise InputError(f"{file} cannot be read ({error}): download it again.") from error

@@ -20,7 +20,6 @@ from asysplat.data.images import PANORAMA, Lens, image_size
 from asysplat.data.readers import common
 from asysplat.data.readers.additions import panorama
 from asysplat.data.readers.colmap import read_model_points
-from asysplat.data.readers.common import number
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
@@ -72,8 +71,6 @@ def read_images(
     def read(index: int, entry: Any) -> PosedImage:
         where = common.frame_label(file, index, entry)
         image = folder / entry["file_path"]
-        if not image.name:
-            raise InputError(f"{where} has the file_path {image}: name its image.")
         # The path may lack the file's extension.
         paths = [image.with_name(image.name + suffix) for suffix in ("", ".png", ".jpg")]
         image = next((path for path in paths if path.is_file()), image)
@@ -91,20 +88,16 @@ def read_images(
 
         def optional_map(key: str) -> Path | None:
             """Return the depth map or mask under `key`; None where there is none."""
-            name = fields.get(key)
-            if not isinstance(name, str | None):
-                raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
-            if name is None:
+            if (name := fields.get(key)) is None:
                 return None
             return common.check_map_size(folder / name, size, f"{where}: {key}")
 
-        unit = number(fields, "depth_unit_scale_factor", where, default=common.MILLIMETERS)
         return PosedImage(
             file=image,
             lens=_lens(fields, size, resized, where),
             cam_to_world=common.opencv_from_opengl(pose),
             depth=optional_map("depth_file_path"),
-            depth_unit=unit,
+            depth_unit=float(fields.get("depth_unit_scale_factor", common.MILLIMETERS)),
             mask=optional_map("mask_path"),
         )
 
@@ -119,26 +112,27 @@ def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
 
     Poses are camera-to-world with OpenCV axes.
     """
-    poses = []
-    for index, entry in enumerate(common.read_frames(file)["frames"]):
-        where = common.frame_label(file, index, entry)
-        pose = common.check_rigid(entry.get("transform_matrix"), f"{where}: transform_matrix")
-        poses.append((entry["file_path"], common.opencv_from_opengl(pose)))
-    return poses
+    with common.file_errors(file):
+        frames = common.read_frames(file)["frames"]
+        return [
+            (
+                entry["file_path"],
+                common.opencv_from_opengl(
+                    common.check_rigid(entry["transform_matrix"], f"{file}, frame {index}")
+                ),
+            )
+            for index, entry in enumerate(frames)
+        ]
 
 
 def read_cameras(file: Path) -> Cameras:
     """Read the cameras of a `transforms.json`, whose images may be absent, without distortion."""
-    content, poses = common.read_frames(file), [pose for _, pose in read_poses(file)]
-    if not poses:
-        raise InputError(f"{file} has no frames: give at least one.")
-    frames = content["frames"]
-    first, where = {**content, **frames[0]}, common.frame_label(file, 0, frames[0])
-    width, height = (round(number(first, side, where)) for side in ("w", "h"))
-    lenses = [
-        _lens({**content, **entry}, (width, height), True, common.frame_label(file, index, entry))
-        for index, entry in enumerate(frames)
-    ]
+    poses = [pose for _, pose in read_poses(file)]
+    with common.file_errors(file):
+        content = common.read_frames(file)
+        fields = [{**content, **entry} for entry in content["frames"]]
+        width, height = round(fields[0]["w"]), round(fields[0]["h"])
+        lenses = [_lens(each, (width, height), True, str(file)) for each in fields]
     matrices = [[[o.fx, 0, o.cx], [0, o.fy, o.cy], [0, 0, 1]] for o in lenses]
     intrinsics, poses = torch.tensor(matrices), torch.tensor(np.stack(poses)).float()
     return Cameras(intrinsics, poses, height, width).validate(str(file))
@@ -160,26 +154,26 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
             f"{', '.join(known)}."
         )
-    width, height = (round(number(sized, key, where)) for key in ("w", "h"))
+    width, height = round(sized["w"]), round(sized["h"])
     if model == PANORAMA:
         return common.scale_lens(panorama(width, height, where), size, where)
     if model in (*PERSPECTIVE_MODELS, "OPENCV"):
         # The formats disagree about what k4 means for them.
-        if number(fields, "k4", where, default=0.0) != 0:
+        if fields.get("k4"):
             raise InputError(
                 f"{where}: k4 is only known for OPENCV_FISHEYE, FULL_OPENCV and "
                 "THIN_PRISM_FISHEYE: name one of them as camera_model, or undistort the images."
             )
-        model = "FULL_OPENCV" if number(fields, "k3", where, default=0.0) else "OPENCV"
+        model = "FULL_OPENCV" if fields.get("k3") else "OPENCV"
     names = DISTORTIONS[model].split()
     lens = Lens(
         width,
         height,
         *_focal(fields, width, height, where),
-        cx=number(fields, "cx", where, default=width / 2),
-        cy=number(fields, "cy", where, default=height / 2),
+        cx=float(fields.get("cx", width / 2)),
+        cy=float(fields.get("cy", height / 2)),
         model=model,
-        distortion=tuple(number(fields, name, where, default=0.0) for name in names),
+        distortion=tuple(float(fields.get(name, 0.0)) for name in names),
     )
     return common.scale_lens(lens, size, where)
 
@@ -189,17 +183,10 @@ def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple
     focal = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in fields:
-            focal[axis] = number(fields, f"fl_{axis}", where)
+            focal[axis] = float(fields[f"fl_{axis}"])
         elif f"camera_angle_{axis}" in fields:
-            angle = number(fields, f"camera_angle_{axis}", where)
-            focal[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+            focal[axis] = 0.5 * pixels / math.tan(0.5 * fields[f"camera_angle_{axis}"])
     if not focal:
         raise InputError(f"{where} has no intrinsics: give fl_x in pixels, or camera_angle_x.")
     fx = focal["x"] if "x" in focal else focal["y"]
-    fy = focal.get("y", fx)
-    if fx <= 0 or fy <= 0:
-        raise InputError(
-            f"{where}: fl_x or fl_y (or camera_angle_x, camera_angle_y) is out of range: "
-            "give lengths > 0 in pixels, or angles between 0 and pi."
-        )
-    return fx, fy
+    return fx, focal.get("y", fx)

@@ -216,7 +216,7 @@ def nan_pose(scene):
             lambda scene: (scene / "sparse/0/points3D.txt").unlink(),
             r"not a complete COLMAP model.*points3D",
         ),
-        "a pose of NaN": (nan_pose, r"1 of 12 .*\n.*pose of 0\.png holds NaN"),
+        "a pose of NaN": (nan_pose, r"1 of 12 .*\n.*pose of 0\.png is not 4x4 or holds NaN"),
         "no image registered": (in_model("images.txt", lambda stored: b""), "registers no image"),
         "no images": (
             lambda scene: shutil.rmtree(scene / "images"),

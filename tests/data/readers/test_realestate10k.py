@@ -36,7 +36,7 @@ def test_scenes_are_found_by_the_index_by_chunk_and_by_address(few, tmp_path):
         assert realestate10k.find_scenes(named) == [address]
     assert opened(address).name == KEY
     (root / "test/index.json").write_text(json.dumps({KEY: "000000.torch", "other": "1.torch"}))
-    with pytest.raises(InputError, match=r"index.json: scene other is in '1.torch'"):
+    with pytest.raises(InputError, match=r"index.json names 1.torch, which does not exist"):
         realestate10k.find_scenes(root)
 
 
@@ -68,53 +68,28 @@ def set_camera(column, value):
     return lambda content: content["cameras"][2].__setitem__(column, value)
 
 
-def set_image(value):
-    return lambda content: content["images"].__setitem__(2, value)
-
-
-@pytest.mark.medium
 @table(
     {
-        "nan": (set_camera(9, float("nan")), "frame 2: its world-to-camera holds NaN"),
-        "no rotation": (set_camera(6, 2.0), "frame 2: its world-to-camera is not a rotation"),
-        "focal length": (set_camera(0, 0.0), "frame 2: its intrinsics are"),
-        "infinite": (set_camera(3, float("inf")), "frame 2: its intrinsics are"),
-        "distortion": (set_camera(4, 0.1), "frame 2: numbers 5 and 6"),
-        "cut short": (set_image(torch.arange(99).byte()), "frame 2 cannot be read as an image"),
-        "empty": (set_image(torch.zeros(0, dtype=torch.uint8)), "frame 2 cannot be read"),
-        "no bytes": (set_image(torch.zeros(4)), "frame 2: its image is no uint8 tensor"),
-        "no tensor": (set_image("frame.jpg"), "frame 2: its image is no uint8 tensor"),
+        "nan": (set_camera(9, float("nan")), "frame 2: world-to-camera is not 4x4 or holds NaN"),
+        "no rotation": (set_camera(6, 2.0), "frame 2: world-to-camera is not a rotation"),
+        "focal length": (set_camera(0, 0.0), "frame 2 has focal lengths 0"),
+        "distortion": (set_camera(4, 0.1), "frame 2: its image is distorted"),
+        "cut short": (
+            lambda content: content["images"].__setitem__(2, torch.arange(99).byte()),
+            "frame 2 cannot be read as an image",
+        ),
     }
 )
 def test_a_bad_image_is_named_or_left_out(chunk, damage, message):
     assert_listed(opened, chunk(damage) / KEY, message)
 
 
-@table(
-    {
-        "17 numbers": (
-            lambda content: content.update(cameras=content["cameras"][:, :17]),
-            r"cameras is \(4, 17\): give a tensor \[V, 18\]",
-        ),
-        "no cameras": (lambda content: content.pop("cameras"), "cameras is NoneType"),
-        "fewer images": (lambda content: content["images"].pop(), "has 4 cameras and images is 3"),
-        "images": (lambda content: content.update(images=None), "images is NoneType"),
-        "no key": (lambda content: content.pop("key"), "000000.torch is no list of scenes"),
-        "another key": (lambda content: content.update(key="a"), f"has no scene {KEY}"),
-    }
-)
-def test_a_broken_scene_is_refused(chunk, damage, message):
-    with pytest.raises(InputError, match=message):
-        opened(chunk(damage) / KEY, on_error="skip")
-
-
 def test_a_chunk_that_is_cut_short_or_absent_is_named(chunk):
     file = chunk()
     stored = file.read_bytes()
-    for left in (0, 10, 5000, -100):
-        file.write_bytes(stored[:left])
-        with pytest.raises(InputError, match=r"000000.torch cannot be read as tensors alone"):
-            opened(file / KEY)
+    file.write_bytes(stored[: len(stored) // 2])
+    with pytest.raises(InputError, match=r"000000.torch cannot be read as tensors alone"):
+        opened(file / KEY)
     file.unlink()
     with pytest.raises(InputError, match=r"000000.torch does not exist"):
         opened(file / KEY)
