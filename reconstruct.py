@@ -36,6 +36,7 @@ from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
 from asysplat.export.viewer import Viewer
+from asysplat.ranges import Count, Fraction, Positive, check_options, check_training
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
@@ -44,7 +45,6 @@ from asysplat.refinement import RefinementSettings, ScaffoldSettings, refine, re
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
 from asysplat.runs.machine import find_device
-from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
 from asysplat.terminal import make_console
 
@@ -57,9 +57,8 @@ def reconstruct(config: DictConfig) -> None:
     config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
         raise InputError(f"no photographs: {typed('reconstruct')} my_scene, a folder.")
-    check_ranges(OmegaConf.masked_copy(config, "speed"))
-    if not is_number(config.last_fit) or not 0 <= config.last_fit <= 1:
-        raise InputError(f"last_fit={config.last_fit}: give a number from 0 to 1.")
+    check_training(OmegaConf.masked_copy(config, "speed"))
+    check_options({"last_fit": config.last_fit}, {"last_fit": Fraction})
     limit = read_limit(config)
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
@@ -164,10 +163,8 @@ def read_limit(config: DictConfig) -> dict[str, float]:
             "repeatable, seconds are not."
         )
     name = "seconds" if config.steps is None else "steps"
-    value, kinds = config[name], int if name == "steps" else int | float
-    if not isinstance(value, kinds) or isinstance(value, bool) or not value > 0:
-        raise InputError(f"{name}={value}: give a number above 0.")
-    return {name: value if name == "steps" else float(value)}
+    check_options({name: config[name]}, {"seconds": Positive, "steps": Count})
+    return {name: config.steps or float(config.seconds)}
 
 
 def initialize(

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Collection
+from typing import Any
 
 MAX_NAMES = 5  # names in a message
 MAX_CHARACTERS = 500  # of another error's in a message
@@ -23,15 +24,33 @@ def list_names(names: Collection[str]) -> str:
 def input_error_behind(error: BaseException) -> InputError | None:
     """Return the InputError that `error` is or was raised from, or None.
 
-    Hydra wraps the errors of constructors that it calls.
+    Hydra wraps the errors of constructors that it calls; pydantic raises a ValidationError.
     """
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
+        if type(seen).__name__ == "ValidationError":  # by name: pydantic may not be loaded
+            return first_mistake(seen)
         seen = cause_of(seen)
     if seen is None:
         return None
     # Data-loader workers prepend their traceback.
     return InputError(str(seen).rpartition(f"{InputError.__module__}.InputError: ")[2])
+
+
+def first_mistake(error: Any, title: str | None = None) -> InputError:
+    """Return the first mistake that a ValidationError of pydantic lists, as a sentence.
+
+    Args:
+        error: the ValidationError.
+        title: the name of the option that was checked; None: that of a dataclass of options.
+    """
+    first = error.errors()[0]
+    if "error" in first.get("ctx", {}):  # raised by a dataclass itself
+        return InputError(str(first["ctx"]["error"]))
+    name = ".".join(map(str, (title or error.title, *first["loc"])))
+    value, words = "null" if first["input"] is None else first["input"], first["msg"]
+    words = words.removeprefix("Input") if words.startswith("Input") else f": {words}"
+    return InputError(f"{name}={value}{words}.")
 
 
 def cause_of(error: BaseException) -> BaseException | None:

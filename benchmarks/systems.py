@@ -28,7 +28,9 @@ from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.refinement import (
+    DEFAULT,
     PUBLISHED_3DGS,
+    SCAFFOLD_GS,
     Refinement,
     RefinementProgress,
     RefinementSettings,
@@ -69,12 +71,12 @@ class RefinedSystem:
 
 
 CURVES = {
-    "AsySplat, refined": RefinedSystem("network", RefinementSettings()),
-    "plane sweep, refined": RefinedSystem("plane_sweep", RefinementSettings()),
+    "AsySplat, refined": RefinedSystem("network", DEFAULT),
+    "plane sweep, refined": RefinedSystem("plane_sweep", DEFAULT),
     "3DGS": RefinedSystem(None, PUBLISHED_3DGS),
     "3DGS, cut": RefinedSystem(None, PUBLISHED_3DGS, cut=True),
-    "Scaffold-GS": RefinedSystem(None, ScaffoldSettings()),
-    "Scaffold-GS, cut": RefinedSystem(None, ScaffoldSettings(), cut=True),
+    "Scaffold-GS": RefinedSystem(None, SCAFFOLD_GS),
+    "Scaffold-GS, cut": RefinedSystem(None, SCAFFOLD_GS, cut=True),
 }
 COLORS = {NETWORK: OURS, "AsySplat, refined": OURS, "plane sweep, refined": "#101112"}
 COLORS |= {"3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}

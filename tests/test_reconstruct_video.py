@@ -87,13 +87,13 @@ def test_names_of_no_photograph_or_of_several_are_refused(files, name, message):
         _find_view(name, files)
 
 
-PATHS, HEIGHTS = "choose own, orbit, none, or photographs", "give a whole number from 2 to 4320, or"
 OPTIONS = [
-    ("path", "spiral", f"video.path=spiral: {PATHS}"),
-    ("path", [], f"video.path=[]: {PATHS}"),
-    ("path", [1, 2], f"video.path=[1, 2]: {PATHS}"),
-    *(("height", value, f"video.height={value}: {HEIGHTS}") for value in (0, -5, "big")),
-    ("fps", 0, "video.fps=0: give a number above 0"),
+    ("path", "spiral", "video.path=spiral should be 'own', 'orbit' or 'none'."),
+    ("path", [], "video.path=[]: List should have at least 1 item"),
+    ("path", [1, 2], "video.path.0=1 should be a valid string."),
+    ("height", 0, "video.height=0 should be greater than or equal to 2."),
+    ("height", "big", "video.height=big should be a valid integer."),
+    ("fps", 0, "video.fps=0 should be greater than 0."),
 ]
 
 

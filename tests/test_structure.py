@@ -22,7 +22,7 @@ BRITISH = (
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
     ("errors", "interrupts", "root"),
-    ("files", "kernels", "overrides", "scene", "terminal"),
+    ("files", "kernels", "overrides", "ranges", "scene", "terminal"),
     ("cli",),
     ("geometry", "ops"),
     ("data", "models", "rendering"),

@@ -4,20 +4,21 @@ Order and crop as in Long-LRM (arXiv 2410.12781).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic.dataclasses import dataclass
 from torch.nn.functional import interpolate
 
-from asysplat.errors import InputError
+from asysplat.ranges import Fraction, PositiveFraction, configured
 from asysplat.scene import Views
 
 GAMMA = 2.2  # gamma of images, about that of sRGB
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=configured("data.augmentation"))
 class Augmentation:
     """Strength of the augmentations of training tasks.
 
@@ -30,21 +31,13 @@ class Augmentation:
         noise: greatest standard deviation of the noise in a task's inputs.
     """
 
-    reverse: float = 0.0
-    shuffle: float = 0.0
-    crop: float = 1.0
-    exposure: float = 0.0
-    white_balance: float = 0.0
-    flicker: float = 0.0
-    noise: float = 0.0
-
-    def __post_init__(self):
-        for name, value in vars(self).items():
-            if not 0 <= value <= 1 or (name == "crop" and value == 0):
-                raise InputError(
-                    f"data.augmentation.{name} is {value}: give a number from 0 to 1"
-                    f"{', and not 0' if name == 'crop' else ''}."
-                )
+    reverse: Fraction = 0.0
+    shuffle: Fraction = 0.0
+    crop: PositiveFraction = 1.0
+    exposure: Fraction = 0.0
+    white_balance: Fraction = 0.0
+    flicker: Fraction = 0.0
+    noise: Fraction = 0.0
 
     def order(self, inputs: Sequence[int], rng: np.random.Generator) -> list[int]:
         """Reverse and shuffle the inputs at random."""

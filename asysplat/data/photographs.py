@@ -17,12 +17,20 @@ from asysplat.data.readers import open_scene
 from asysplat.data.selection.views import evenly_spaced
 from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError
+from asysplat.ranges import AtLeastTwo, Count, check_options
 from asysplat.scene import Cameras, Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: bad images are decoded at it, before the size is known
 MAX_BYTES = 2 * 10**9  # size of all input views; a refinement takes about as much again
 BYTES_PER_PIXEL = 15  # float32 RGB, and the same at half the size
+RANGES = {
+    "height": Count,
+    "width": Count | None,
+    "views": AtLeastTwo | None,
+    "held_out_every": AtLeastTwo | None,
+    "max_held_out": Count,
+}
 GIVEN = CameraOptions()
 
 
@@ -103,7 +111,8 @@ def open_photographs(
         >>> len(photographs.held_out_files)
         4
     """
-    _check_counts(height, width, views, held_out_every, max_held_out)
+    counts = (height, width, views, held_out_every, max_held_out)
+    check_options(dict(zip(RANGES, counts, strict=True)), RANGES)
     if found := find_missing(path, layout, on_error, cameras):
         say(f"cameras: found, see {found}")
         path, layout = found, "auto"
@@ -151,19 +160,6 @@ def open_photographs(
         total=len(scene.images),
         origin=scene.origin,
     )
-
-
-def _check_counts(
-    height: int, width: int | None, views: int | None, held_out_every: int | None, max_held_out: int
-) -> None:
-    counts = (height, width or 1, 2 if views is None else views, held_out_every or 2, max_held_out)
-    whole = all(isinstance(count, int) for count in counts)
-    if not whole or min(counts[:2]) < 1 or min(counts[2:4]) < 2 or max_held_out < 1 or width == 0:
-        raise InputError(
-            f"height={height}, width={width}, views={views}, held_out_every={held_out_every} and "
-            f"max_held_out={max_held_out}: give whole numbers, at least 1 pixel, 2 views, 1 "
-            "held-out view, and held_out_every of 2 or more, or null."
-        )
 
 
 def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> None:

@@ -1,22 +1,22 @@
 """Define protocols: named options of the metrics, which their numbers depend on."""
 
 import warnings
-from dataclasses import dataclass, fields
-from typing import Literal, get_args, get_type_hints
+from typing import Literal
 
 from jaxtyping import Float
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from asysplat.errors import InputError
 from asysplat.evaluation import metrics
 from asysplat.evaluation.lpips import MIN_SIDE, lpips_distance
 from asysplat.evaluation.metrics import BASELINES, Depths, Images, PerView
+from asysplat.ranges import configured
 from asysplat.scene import Views
 
 BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=configured("metrics"))
 class Protocol:
     """Computes metrics with fixed options; numbers of different protocols cannot be compared.
 
@@ -30,9 +30,6 @@ class Protocol:
         lpips_net: LPIPS' backbone, "alex" or "vgg".
         mean_over: "images": all images alike, or "scenes": first the mean of each scene's images.
         depth_alignment: see `metrics.abs_rel`; for data without metric depth "median".
-
-    Raises:
-        InputError: an option is none of its choices, or the name no word.
     """
 
     name: str
@@ -42,18 +39,6 @@ class Protocol:
     lpips_net: Literal["alex", "vgg"]
     mean_over: Literal["images", "scenes"]
     depth_alignment: metrics.Alignment
-
-    def __post_init__(self):
-        hints = get_type_hints(type(self))
-        for field in fields(self):
-            value, hint = getattr(self, field.name), hints[field.name]
-            if hint is str and not isinstance(value, str):
-                raise InputError(f"metrics.{field.name} is {value!r}: give a word.")
-            choices = (True, False) if hint is bool else get_args(hint)
-            if choices and value not in choices:
-                raise InputError(
-                    f"metrics.{field.name} is {value!r}: choose {' or '.join(map(str, choices))}."
-                )
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError if images of this size cannot be measured; warn if LPIPS cannot be."""

@@ -1,14 +1,16 @@
 """What a network need not compute: layers of a scene that the prior knows, and faint Gaussians."""
 
-from dataclasses import dataclass, fields
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from asysplat.errors import InputError
+from asysplat.ranges import Fraction, PositiveFraction, configured
 from asysplat.scene import Gaussians
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=configured("speed"))
 class EarlyExit:
     """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing.
 
@@ -17,23 +19,14 @@ class EarlyExit:
         skip_network_above: skip the network: the Gaussians are the prior's own.
     """
 
-    skip_layers_above: float | None = None
-    skip_network_above: float | None = None
-
-    def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None and not 0 < value <= 1:
-                raise InputError(
-                    f"speed.{field.name}={value}: give a number above 0 and up to 1, or null to "
-                    "skip nothing."
-                )
+    skip_layers_above: PositiveFraction | None = None
+    skip_network_above: PositiveFraction | None = None
 
 
 EXACT = EarlyExit()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=configured("model.prune"))
 class Prune:
     """Keep the most opaque Gaussians and a few of the rest, so that these learn too.
 
@@ -47,15 +40,8 @@ class Prune:
         random_ratio: fraction of the kept ones that is not chosen by opacity, in [0, 1].
     """
 
-    prune_ratio: float
-    random_ratio: float = 0.0
-
-    def __post_init__(self):
-        if not (0 <= self.prune_ratio < 1 and 0 <= self.random_ratio <= 1):
-            raise InputError(
-                f"model.prune: prune_ratio={self.prune_ratio} must be in [0, 1) and "
-                f"random_ratio={self.random_ratio} in [0, 1]."
-            )
+    prune_ratio: Annotated[float, Field(ge=0, lt=1)]
+    random_ratio: Fraction = 0.0
 
     def __call__(self, gaussians: Gaussians) -> Gaussians:
         """Select among Gaussians [B, N], the same number in each scene."""

@@ -3,42 +3,36 @@
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from omegaconf import DictConfig, ListConfig
+from pydantic import Field
 from torch import Tensor
 
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.export import orbit, smoothed_path
+from asysplat.ranges import Positive, check_options
 from asysplat.refinement import AnchorScene
 from asysplat.rendering import render
-from asysplat.runs.ranges import is_number, is_whole
 from asysplat.scene import Cameras, Gaussians
 
 MAX_HEIGHT = 4320  # pixels of 8K, the most that decoders of H.264 take
-CAMERA_PATHS = ("own", "orbit", "none")
+CameraPath = Literal["own", "orbit", "none"]
 
 
 def check_video(video: DictConfig) -> None:
     """Check the options of a video, except for the names of photographs, see `find_views`."""
-    height = video.height
-    if not (height is None or is_whole(height, 2, MAX_HEIGHT + 1)):
-        raise InputError(
-            f"video.height={height}: give a whole number from 2 to {MAX_HEIGHT}, or null for the "
-            "photographs' height."
-        )
-    for name in ("seconds", "fps"):
-        if not (is_number(video[name]) and video[name] > 0):
-            raise InputError(f"video.{name}={video[name]}: give a number above 0.")
-    path = video.path
-    names = isinstance(path, ListConfig) and [isinstance(name, str) for name in path]
-    if path not in CAMERA_PATHS and not (names and all(names)):
-        raise InputError(
-            f"video.path={path}: choose {', '.join(CAMERA_PATHS)}, or photographs that it passes, "
-            "such as [IMG_01.jpg,IMG_20.jpg]."
-        )
+    listed = isinstance(video.path, ListConfig)
+    ranges = {
+        "video.path": Annotated[list[str], Field(min_length=1)] if listed else CameraPath,
+        "video.height": Annotated[int, Field(ge=2, le=MAX_HEIGHT)] | None,
+        "video.seconds": Positive,
+        "video.fps": Positive,
+    }
+    check_options({f"video.{name}": value for name, value in video.items()}, ranges)
 
 
 def find_views(video: DictConfig, inputs: Sequence[str], held_out: Sequence[str]) -> list[int]:

@@ -2,8 +2,14 @@
 
 from asysplat.refinement.merge import merge_to_limit
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine
-from asysplat.refinement.scaffold_gs import AnchorScene, ScaffoldSettings, refine_scaffold
+from asysplat.refinement.scaffold_gs import (
+    SCAFFOLD_GS,
+    AnchorScene,
+    ScaffoldSettings,
+    refine_scaffold,
+)
 from asysplat.refinement.settings import (
+    DEFAULT,
     PAPER,
     PUBLISHED_3DGS,
     Rates,
@@ -12,8 +18,10 @@ from asysplat.refinement.settings import (
 )
 
 __all__ = [
+    "DEFAULT",
     "PAPER",
     "PUBLISHED_3DGS",
+    "SCAFFOLD_GS",
     "AnchorScene",
     "Rates",
     "Refinement",

@@ -19,6 +19,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import check_device
 from asysplat.ops.image_loss import image_loss
+from asysplat.ranges import Count, Positive, check_options
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
 from asysplat.refinement.densification.relocate import McmcDensifier
@@ -32,7 +33,7 @@ from asysplat.refinement.fields import (
     correct_poses,
 )
 from asysplat.refinement.isotropic import footprints, random_order
-from asysplat.refinement.settings import RefinementSettings
+from asysplat.refinement.settings import DEFAULT, RefinementSettings
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
@@ -78,7 +79,7 @@ class Refinement:
         gaussians: Gaussians,
         views: Views,
         background: Float[Tensor, "3"] | None = None,
-        settings: RefinementSettings = RefinementSettings(),  # noqa: B008
+        settings: RefinementSettings = DEFAULT,
         seed: int = 0,
     ):
         if gaussians.num_gaussians == 0:
@@ -207,7 +208,7 @@ class Refinement:
 def refine(
     gaussians: Gaussians,
     views: Views,
-    settings: RefinementSettings = RefinementSettings(),  # noqa: B008
+    settings: RefinementSettings = DEFAULT,
     *,
     seconds: float | int | None = None,
     steps: int | None = None,
@@ -253,10 +254,11 @@ class Budget:
 
 def read_budget(seconds: float | int | None, steps: int | None) -> Budget:
     """Return the one that is given, or raise InputError."""
-    budgets = [budget for budget in (seconds, steps) if budget is not None]
-    if len(budgets) != 1 or not budgets[0] > 0:
-        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
-    return Budget(budgets[0], timed=steps is None)
+    given = {k: v for k, v in {"seconds": seconds, "steps": steps}.items() if v is not None}
+    if len(given) != 1:
+        raise InputError(f"seconds={seconds} and steps={steps}: give one of them.")
+    check_options(given, {"seconds": Positive, "steps": Count})
+    return Budget(*given.values(), timed=steps is None)
 
 
 def run_steps(

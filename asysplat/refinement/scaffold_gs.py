@@ -7,21 +7,26 @@ constants of its code (city-super/Scaffold-GS, without appearance codes).
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.ops.image_loss import image_loss
+from asysplat.ranges import Count, Fraction, configured
 from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.densification.clone_split import screen_gradients
 from asysplat.refinement.fields import Parameters
 from asysplat.refinement.isotropic import random_order
 from asysplat.refinement.refine import RefinementProgress, read_budget, run_steps
+from asysplat.refinement.settings import read_settings
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -41,31 +46,16 @@ MIN_OPACITY = 0.005  # anchors whose Gaussians have less together, on average, a
 SEEN_OFTEN = 0.8  # fraction of a round in which an anchor must be seen; half of it for a Gaussian
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=configured("refinement"))
 class ScaffoldSettings:
-    """Settings of a refinement by Scaffold-GS; the defaults are those published."""
+    """Settings of a refinement by Scaffold-GS; `SCAFFOLD_GS` are those published."""
 
-    voxel: float = 1e-3  # side of the cells that hold an anchor, by the farthest camera's distance
-    max_gaussians: int | None = None  # ten for each anchor; None: no limit
-    first_statistics: int = 500  # step from which gradients and opacities are observed
-    first_round: int = 1500  # step of the first round of growth
-    round: int = 100  # steps from one round to the next
-    densify_until: float = 0.5  # initial part of the refinement, with growth
-
-    def __post_init__(self):
-        """Check the ranges."""
-        for name in ("first_statistics", "first_round", "round"):
-            if getattr(self, name) < 1:
-                raise InputError(f"refinement.{name}={getattr(self, name)}: give at least 1.")
-        if self.max_gaussians is not None and self.max_gaussians < OFFSETS:
-            raise InputError(
-                f"refinement.max_gaussians={self.max_gaussians}: give at least {OFFSETS}, those of "
-                "an anchor, or null."
-            )
-        if not 0 < self.voxel < 1:
-            raise InputError(f"refinement.voxel={self.voxel}: give a number between 0 and 1.")
-        if not 0 <= self.densify_until <= 1:
-            raise InputError(f"refinement.densify_until={self.densify_until}: give 0 to 1.")
+    voxel: Annotated[float, Field(gt=0, lt=1)]
+    max_gaussians: Annotated[int, Field(ge=OFFSETS)] | None
+    first_statistics: Count
+    first_round: Count
+    round: Count
+    densify_until: Fraction
 
     @property
     def max_anchors(self) -> int:
@@ -75,6 +65,9 @@ class ScaffoldSettings:
     def initial_limit(self) -> int:
         """The greatest number of anchors to start with."""
         return min(MAX_INITIAL_ANCHORS, self.max_anchors)
+
+
+SCAFFOLD_GS: ScaffoldSettings = read_settings("scaffold_gs")
 
 
 @dataclass(frozen=True)
@@ -341,7 +334,7 @@ class ScaffoldRefinement:
 def refine_scaffold(
     gaussians: Gaussians,
     views: Views,
-    settings: ScaffoldSettings = ScaffoldSettings(),
+    settings: ScaffoldSettings = SCAFFOLD_GS,
     *,
     seconds: float | int | None = None,
     steps: int | None = None,

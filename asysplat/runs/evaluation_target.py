@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
-from asysplat.runs.ranges import check_ranges, is_number, is_whole
+from asysplat.ranges import Count, Positive, check_options, check_training
 from asysplat.runs.run_config import plain_options, read_config
 from asysplat.runs.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
 from asysplat.runs.systems import contents_below, describe_system
@@ -73,7 +73,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
             config.pop(name, None)
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    check_ranges(config)
+    check_training(config)
     fingerprint = _describe(config, options)
     if system is None:
         stem = Path(options.init_path).stem
@@ -89,13 +89,14 @@ def _describe_source(
 ) -> tuple[str, dict[str, Any]]:
     """Return the name of another system, and what its scenes depend on."""
     if system == "refinement":
-        _check_limits(options)
+        keys = ("refinement_seconds", "refinement_steps")
+        key = keys[options.refinement_steps is not None]
+        check_options({key: options[key]}, dict(zip(keys, (Positive, Count), strict=True)))
         (name,) = (
             value
             for key, _, value in (override.partition("=") for override in overrides)
             if key.lstrip("+") == system
         )
-        keys = ("refinement_seconds", "refinement_steps")
         return name, plain_options(options.refinement) | {key: options[key] for key in keys}
     path = Path(os.path.abspath(options[system]))
     name = path.stem if path.is_file() else path.name
@@ -140,18 +141,6 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
     described["evaluation/post_optimization_steps"] = str(options.post_optimization_steps)
     return described
-
-
-def _check_limits(options: DictConfig) -> None:
-    """Check the seconds and steps of a refinement."""
-    seconds, steps = options.refinement_seconds, options.refinement_steps
-    if steps is not None and not is_whole(steps, 1):
-        raise InputError(
-            f"refinement_steps={steps}: give a whole number of at least 1, or null for "
-            "refinement_seconds."
-        )
-    if steps is None and not (is_number(seconds) and seconds > 0):
-        raise InputError(f"refinement_seconds={seconds}: give a number above 0.")
 
 
 def _check_new(folder: Path, options: DictConfig) -> None:

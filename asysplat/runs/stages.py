@@ -8,8 +8,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from asysplat.errors import InputError
+from asysplat.ranges import check_training
 from asysplat.runs.checkpoints import read_metadata
-from asysplat.runs.ranges import check_ranges
 from asysplat.runs.summary import Results
 
 STAGE_RECORD = "StageRecord"  # the callback in whose state a checkpoint names its stage
@@ -45,11 +45,11 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
 def check_stages(stages: Sequence[DictConfig]) -> None:
     """Check the options of every stage, so that none is refused after days of training."""
     if len(stages) == 1:
-        check_ranges(stages[0])
+        check_training(stages[0])
         return
     for stage in stages:
         try:
-            check_ranges(stage)
+            check_training(stage)
             with torch.device("meta"):
                 net = instantiate(stage.model)
             net.check_size(stage.data.height, stage.data.width)

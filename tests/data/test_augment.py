@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
 from asysplat.data.augment import Augmentation, center_crop
-from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 HEIGHT, WIDTH = 45, 80
@@ -133,5 +133,5 @@ def test_augmented_images_stay_in_range_and_are_unchanged_by_default():
 
 def test_options_of_augmentation_out_of_range_are_refused():
     for name, value in {"reverse": 1.5, "shuffle": -0.1, "crop": 0.0, "noise": 2.0}.items():
-        with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):
+        with pytest.raises(ValidationError, match=rf"data\.augmentation\n{name}"):
             Augmentation(**{name: value})

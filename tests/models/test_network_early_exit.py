@@ -5,7 +5,9 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from pydantic import ValidationError
 from test_prior import wall
 from tiny import NETWORK
 
@@ -121,15 +123,16 @@ def test_presets_skip_where_the_prior_is_confident(net, composed):
 @pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")], ids=str)
 @pytest.mark.parametrize("name", [field.name for field in fields(EarlyExit)])
 def test_bad_thresholds_are_refused(name, value):
-    with pytest.raises(InputError, match=rf"speed\.{name}=.*above 0 and up to 1"):
+    with pytest.raises(ValidationError, match=rf"speed\n{name}"):
         EarlyExit(**{name: value})
 
 
 def test_a_bad_override_is_one_sentence(composed):
     config = composed("speed=fast", "speed.skip_network_above=2.0")
-    with pytest.raises(Exception, match=r"speed\.skip_network_above=2\.0") as caught:
+    with pytest.raises(InstantiationException) as caught:
         instantiate(config.speed)
-    assert isinstance(input_error_behind(caught.value), InputError)
+    sentence = "speed.skip_network_above=2.0 should be less than or equal to 1."
+    assert str(input_error_behind(caught.value)) == sentence
 
 
 def test_early_exit_needs_a_prior_and_one_scene(build, net):

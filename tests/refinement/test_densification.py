@@ -31,7 +31,7 @@ from asysplat.refinement.densification.spawn import (
 )
 from asysplat.refinement.fields import Fields
 from asysplat.refinement.isotropic import isotropic_gaussians
-from asysplat.refinement.settings import Rates
+from asysplat.refinement.settings import DEFAULT
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Views
 
@@ -207,11 +207,11 @@ def test_copies_have_a_new_optimizer_state_and_others_keep_theirs(scene):
     fields = fields_of(scene[0])
     up = {name: torch.ones_like(tensor) for name, tensor in fields.parameters.items()}
     for _ in range(5):
-        fields.step(up, Rates(), 1.0)
+        fields.step(up, DEFAULT.rates, 1.0)
     relocate(fields, 100, generator())
     before = fields.parameters["logits"].clone()
     down = {name: -torch.ones_like(tensor) for name, tensor in fields.parameters.items()}
-    fields.step(down, Rates(opacities=0.1), 1.0)
+    fields.step(down, replace(DEFAULT.rates, opacities=0.1), 1.0)
     moved = fields.parameters["logits"] - before
     means = fields.gaussians().means
     several = (means[:, None] == means[None]).all(-1).sum(1) > 1

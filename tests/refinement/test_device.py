@@ -1,11 +1,13 @@
 """Refinement on a device other than the CPU: nothing is left behind on the CPU."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from pretend_device import DEVICE, pretended_device
 
 from asysplat.errors import InputError
-from asysplat.refinement import Rates, RefinementSettings, StepSchedule, refine
+from asysplat.refinement import DEFAULT, StepSchedule, refine
 from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.scene import Cameras, Views
 
@@ -35,12 +37,13 @@ def watched(gaussians, views, settings):
 def test_a_refinement_runs_where_its_inputs_are(scene, monkeypatch, densify):
     gaussians, views = scene
     schedule = StepSchedule(first_round=2, round=2, opacity_reset=5, sh_degree=2)
-    settings = RefinementSettings(
+    settings = replace(
+        DEFAULT,
         densify=densify,
         max_gaussians=100,
         ssim=0.2,
         every=schedule if densify == "gradient" else None,
-        rates=Rates(exposure=1e-3, poses=1e-4),
+        rates=replace(DEFAULT.rates, exposure=1e-3, poses=1e-4),
     )
     expected, status = watched(gaussians, views, settings)
     with pretended_device(monkeypatch) as device:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.settings import Rates
+from asysplat.refinement.settings import DEFAULT
 from asysplat.scene import Gaussians
 
 NAMES = [field.name for field in fields_of(Gaussians)]
@@ -62,7 +62,9 @@ def test_sh_are_cut_or_filled_with_0(gaussians, degree):
 
 def test_the_first_step_is_as_long_as_the_rates(gaussians):
     """Adam's first step is the rate; a mean moves in its own unit."""
-    rates = Rates(means=0.5, quats=1e-3, scales=1e-2, opacities=0.1, sh=0.02, sh_rest=0.25)
+    rates = replace(
+        DEFAULT.rates, means=0.5, quats=1e-3, scales=1e-2, opacities=0.1, sh=0.02, sh_rest=0.25
+    )
     start = gaussians.map(torch.clone)
     fields = Fields(gaussians, units(gaussians))
     before = {name: tensor.clone() for name, tensor in fields.parameters.items()}
@@ -85,7 +87,7 @@ def test_invisible_rows_and_fields_without_a_rate_stay(gaussians):
     for gradient in gradients.values():
         gradient[::3] = 0
     gradients["sh"][1] = torch.nan
-    rates = Rates(quats=0.0, opacities=0.0)
+    rates = replace(DEFAULT.rates, quats=0.0, opacities=0.0)
     seen = fields.step(gradients, rates, 1.0)
     assert torch.equal(seen, torch.arange(12) % 3 > 0)
     assert fields.optimizer.non_finite == 1
@@ -111,7 +113,7 @@ def test_leaves_have_gradients_and_parameters_none(gaussians):
 
 def test_rows_are_kept_and_added_with_a_unit_of_their_own(gaussians):
     fields = Fields(gaussians, units(gaussians))
-    fields.step(gradients_of(fields), Rates(), 1.0)
+    fields.step(gradients_of(fields), DEFAULT.rates, 1.0)
     before, index = fields.gaussians(), torch.tensor([7, 0, 7])
     fields.keep(index)
     assert len(fields) == 3
@@ -126,6 +128,6 @@ def test_rows_are_kept_and_added_with_a_unit_of_their_own(gaussians):
     added = found.keep(~old)
     assert (added.sh[:, 1:] == 0).all()
     assert_close(replace(added, sh=added.sh[:, :1]), more)
-    fields.step(gradients_of(fields), Rates(means=1.0), 1.0)
+    fields.step(gradients_of(fields), replace(DEFAULT.rates, means=1.0), 1.0)
     moved = added.means - fields.gaussians().means[3:]
     torch.testing.assert_close(moved, torch.full_like(moved, 7.0), rtol=1e-3, atol=0)

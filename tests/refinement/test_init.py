@@ -18,7 +18,7 @@ from asysplat.refinement.init import (
 )
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
-from asysplat.refinement.settings import RefinementSettings
+from asysplat.refinement.settings import DEFAULT
 from asysplat.scene import Cameras, Views
 
 
@@ -297,4 +297,4 @@ def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
 )
 def test_a_start_from_what_is_lacking_is_refused(init, message):
     with pytest.raises(InputError, match=message):
-        initial_gaussians(init, front_views(), RefinementSettings())
+        initial_gaussians(init, front_views(), DEFAULT)

@@ -23,7 +23,7 @@ from poison import FILLS, poisoned
 from asysplat import Gaussians, Views, load, open_photographs, refine, render
 from asysplat.data import ProceduralScene
 from asysplat.evaluation.metrics import mean_color_images, psnr
-from asysplat.refinement import RefinementSettings
+from asysplat.refinement import DEFAULT
 from asysplat.refinement.init import initial_gaussians
 
 SIDE = 256  # pixels
@@ -109,7 +109,7 @@ elif __name__ == "__main__":
     with poisoned(FILLS[0] if checked else None):
         photographs = open_photographs(scene, SIDE, SIDE, held_out_every=None)
         views = photographs.inputs
-        start = initial_gaussians("plane_sweep", photographs.inputs, RefinementSettings())
+        start = initial_gaussians("plane_sweep", photographs.inputs, DEFAULT)
         end = refine_and_draw(views, start, steps)
         images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
     flat = mean_color_images(views, views)

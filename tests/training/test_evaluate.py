@@ -356,11 +356,11 @@ REFUSED = {
     ),
     "a time of nothing": (
         ["refinement=3dgs", "refinement_seconds=0"],
-        "refinement_seconds=0: give a number above 0",
+        "refinement_seconds=0 should be greater than 0.",
     ),
     "half a step": (
         ["refinement=3dgs", "refinement_steps=0.5"],
-        "refinement_steps=0.5: give a whole number of at least 1, or null",
+        "refinement_steps=0.5 should be a valid integer.",
     ),
     "an unknown refinement": (["refinement=nerf"], "refinement/nerf"),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
@@ -372,7 +372,7 @@ REFUSED = {
         ["init_path=shipped", "post_optimization_steps=[3,3]"],
         "above the one before",
     ),
-    "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),
+    "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0 should be"),
     "an unknown option": (["ryn=last"], "override 'ryn'"),
 }
 
