@@ -224,7 +224,7 @@ MISTAKES = [
     (variant("refined", views=0), r"refined\.a: views=0: give a whole number from 1\."),
     (
         variant("refined", refinement={"half_resolution_until": 2.0}),
-        r"^refinement\.half_resolution_until=2\.0: give 0 to 1",
+        r"^refinement\.half_resolution_until=2\.0 should be less than or equal to 1",
     ),
     (variant("reconstruct", init="dust"), r"reconstruct\.a: init=dust is unknown: choose from"),
     (variant("reconstruct", seconds=0), r"steps=None and seconds=0: give one of them, above 0\."),

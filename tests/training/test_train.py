@@ -179,7 +179,7 @@ def test_training_on_a_real_scene_leaves_its_files(train, shared, name):
 
 REFUSED = {
     "one of a sweep": (["-m", "seed=-1,x"], "seed=x should be a valid integer."),
-    "an unknown setting of a protocol": (["metrics.depth_alignment=mean"], "choose none or median"),
+    "an unknown setting of a protocol": (["metrics.depth_alignment=mean"], "'none' or 'median'"),
     "a trainer that cannot be": (["trainer.precision=bf17"], "error: trainer: Precision 'bf17' is"),
     "images too small to measure": (
         ["data.height=4", "data.width=4", "model.patch_coarse=4", "model.patch_fine=2"],
