@@ -250,7 +250,7 @@ def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTas
     sequences = {task.sequence.name: task.sequence for task in tests.tasks}
 
     def predict(sample: Sample) -> PredictScene:
-        points = getattr(sequences[sample["scene"]], "points", None)  # of files alone
+        points = sequences[sample["scene"]].points
         points = normalized_points(points, sample["frame"])
 
         def refined(inputs: Views) -> Gaussians | AnchorScene:

@@ -32,7 +32,7 @@ from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
-from asysplat.data.selection.views import evenly_spaced, uniform_selection
+from asysplat.data.selection import evenly_spaced, uniform_selection
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured_cost import PEAK_MEMORY, CostMeter

@@ -27,7 +27,7 @@ from asysplat.data.loader import (
     split_batch,
 )
 from asysplat.data.normalize import Normalization, depths_of_points, normalize
-from asysplat.data.selection.views import Selection
+from asysplat.data.selection import Selection
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -62,8 +62,9 @@ class SceneDataModule(lightning.LightningDataModule):
     """Lightning's data module of tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run depends only on the seed and i,
-    and an epoch continues where the previous one ended. Processes take turns at the tasks of each
-    step and the scenes of each evaluation: Lightning needs use_distributed_sampler=False.
+    and an epoch continues where the previous one ended. The tasks of a step, and
+    the scenes of an evaluation, are assigned to processes round-robin: Lightning needs
+    use_distributed_sampler=False.
 
     Args:
         name: the data set's name in metrics.
@@ -319,7 +320,7 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
     inputs, targets = (
         views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )
-    sparse = getattr(task.sequence, "points", None) if points else None  # none of synthetic scenes
+    sparse = task.sequence.points if points else None
     if sparse is not None:
         inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)

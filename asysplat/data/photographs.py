@@ -14,7 +14,7 @@ from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.readers import open_scene
-from asysplat.data.selection.views import evenly_spaced
+from asysplat.data.selection import evenly_spaced
 from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.ranges import AtLeastTwo, Count, check_options

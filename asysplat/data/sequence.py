@@ -33,7 +33,6 @@ from asysplat.scene import Cameras, Views
 # A scene is moved if its cameras are this far from the origin, in units and in their extent.
 FAR = 100.0
 MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
-MAX_DISTANCE = 1e8  # distance up to which cameras within MIN_EXTENT may be in one place
 Points = Float[ndarray, "P 3"]
 
 
@@ -53,6 +52,10 @@ class ImageSequence(Protocol):
     name: str  # unique within the data set
     num_images: int
     cameras: Cameras  # cameras of all images, [num_images, ...]
+
+    @property
+    def points(self) -> Points | None:
+        """Sparse points of the place's surfaces; None where they are not known."""
 
     def views(self, indices: Sequence[int]) -> Views:
         """Return the images at `indices`, in that order: pixels in [0, 1], depths where known."""
@@ -132,12 +135,6 @@ def near_origin(scene: PosedScene) -> PosedScene:
     if any(scene.origin) or not np.isfinite(centers).all() or not len(centers):
         return scene
     distance, extent = np.abs(centers).max(), np.ptp(centers, axis=0).max()
-    if distance > MAX_DISTANCE and extent < MIN_EXTENT * distance:
-        raise InputError(
-            f"{scene.name}: the cameras are {distance:.3g} units from the origin and at most "
-            f"{extent:.3g} from each other, which float64 does not resolve: subtract an offset "
-            "from their positions."
-        )
     if distance < FAR or distance < FAR * extent or extent < MIN_EXTENT * distance:
         return scene
     origin = centers.mean(0).round()
@@ -175,7 +172,6 @@ class FileSequence:
 
     @property
     def points(self) -> Points | None:
-        """Sparse points of the scene's surfaces; None where the files have none."""
         return self.scene.points
 
     def views(self, indices: Sequence[int]) -> Views:

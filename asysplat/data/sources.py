@@ -10,14 +10,21 @@ import numpy as np
 
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.readers import find_scenes, open_scene
-from asysplat.data.selection import named_selection, views
+from asysplat.data.selection import (
+    Selection,
+    Split,
+    evenly_spaced,
+    grown_window,
+    named_selection,
+    training_images,
+    training_selection,
+    uniform_selection,
+)
 from asysplat.data.selection.index import read_index, select_from_index
-from asysplat.data.selection.views import Selection, Split
 from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
 
 MAX_OPEN = 64  # scenes of a folder
-MAX_SCENES = 100_000  # synthetic ones of a split, which are listed before any is drawn
 
 
 @dataclass(frozen=True)
@@ -80,15 +87,13 @@ class ProceduralSource:
         self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
     ) -> Task:
         scene = self._scene("train", int(rng.integers(2**31)))
-        window = views.grown_window(self.first_window, self.window, grown)
-        return Task(scene, views.training_selection(self.num_images, inputs, targets, window, rng))
+        window = grown_window(self.first_window, self.window, grown)
+        return Task(scene, training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         """See Source."""
-        selection = views.uniform_selection(self.num_images, inputs, targets)
+        selection = uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
-        if count > MAX_SCENES:
-            raise InputError(f"data.{split}_scenes is {count}: give at most {MAX_SCENES:,}.")
         return [Task(self._scene(split, index), selection) for index in range(count)]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
@@ -185,14 +190,25 @@ class FilesSource:
     def training(
         self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
     ) -> Task:
-        sequence = self.training_folder[self._training[rng.integers(len(self._training))]]
+        _, scenes = self._split
+        if not self.split_by_scenes and self.selection in ("uniform", "index"):
+            raise InputError(
+                f"data.selection={self.selection} would test images that are trained on: name the "
+                "scenes to test with data.test_root, or use every_8th, kmeans or first_96."
+            )
+        if not scenes:
+            raise InputError(
+                f"data.test_root and data.val_scenes={self.val_scenes} leave no scene of "
+                f"data.root={self.root} to train on: give more scenes, or validate fewer."
+            )
+        sequence = self.training_folder[scenes[rng.integers(len(scenes))]]
         count = sequence.num_images
-        images = range(count) if self.split_by_scenes else views.training_images(count)
-        drawn = views.training_selection(
+        images = range(count) if self.split_by_scenes else training_images(count)
+        drawn = training_selection(
             len(images),
             inputs,
             targets,
-            views.grown_window(self.first_window, self.window, grown),
+            grown_window(self.first_window, self.window, grown),
             rng,
             self.targets_may_be_inputs,
         )
@@ -203,7 +219,7 @@ class FilesSource:
         if split == "test" and self.index is not None:
             return self._index_tasks(self.index, inputs)
         selection = "every_8th" if self.selection == "index" else self.selection
-        validated = (self.training_folder[scene] for scene in self._validation)
+        validated = (self.training_folder[scene] for scene in self._split[0])
         return [
             Task(sequence, named_selection(selection, sequence.cameras, inputs, targets, split))
             for sequence in (self._tests if split == "test" else validated)
@@ -224,35 +240,16 @@ class FilesSource:
         return [folder[index] for index, names in enumerate(named) if names]
 
     @cached_property
-    def _untested(self) -> list[int]:
-        """The scenes of `root` that may train and validate."""
-        scenes = range(len(self.training_folder))
-        if not self.split_by_scenes:
-            return list(scenes)
-        tested = self._tests if self.scenes is None else self.test_folder
-        names = {sequence.name for sequence in tested}
-        return [scene for scene in scenes if names.isdisjoint(self.training_folder.folders(scene))]
-
-    @cached_property
-    def _validation(self) -> list[int]:
-        return views.evenly_spaced(self._untested, min(self.val_scenes, len(self._untested)))
-
-    @cached_property
-    def _training(self) -> list[int]:
-        if not self.split_by_scenes:
-            if self.selection in ("uniform", "index"):
-                raise InputError(
-                    f"data.selection={self.selection} would test images that are trained on: name "
-                    "the scenes to test with data.test_root, or use every_8th, kmeans or first_96."
-                )
-            return self._untested
-        training_scenes = sorted(set(self._untested) - set(self._validation))
-        if not training_scenes:
-            raise InputError(
-                f"data.root has {len(self._untested)} scenes that data.test_root does not test, "
-                f"and data.val_scenes is {self.val_scenes}: give more scenes, or validate fewer."
-            )
-        return training_scenes
+    def _split(self) -> tuple[list[int], list[int]]:
+        """The scenes of `root` that validate, and those that train; no tested scene does."""
+        scenes = list(range(len(self.training_folder)))
+        if self.split_by_scenes:
+            tested = self._tests if self.scenes is None else self.test_folder
+            names = {sequence.name for sequence in tested}
+            folders = self.training_folder.folders
+            scenes = [scene for scene in scenes if names.isdisjoint(folders(scene))]
+        validated = evenly_spaced(scenes, min(self.val_scenes, len(scenes)))
+        return validated, sorted({*scenes} - {*validated}) if self.split_by_scenes else scenes
 
     def _index_tasks(self, file: str, inputs: int) -> list[Task]:
         index = read_index(file, inputs)

@@ -21,8 +21,6 @@ from asysplat.export.page import BLACK, PAGE, write_page
 from asysplat.export.scene_cameras import camera_before
 from asysplat.scene import Gaussians
 
-MAX_TEXT = 80  # characters of a file in a message
-
 
 class Notes(NamedTuple):
     """What a file says besides its Gaussians.
@@ -111,7 +109,7 @@ def read_notes(path: Path) -> Notes:
             antialiased = spz.is_antialiased(path)
         case ".sog":
             antialiased = sog.is_antialiased(path)
-    numbers = {name: _numbers(path, name, texts.get(name, "")) for name in ("offset", "background")}
+    numbers = {name: _numbers(texts.get(name, "")) for name in ("offset", "background")}
     return Notes(
         offset=numbers["offset"] or NO_NOTES.offset,
         background=numbers["background"],
@@ -119,18 +117,13 @@ def read_notes(path: Path) -> Notes:
     )
 
 
-def _numbers(path: Path, name: str, text: str) -> tuple[float, ...]:
-    """Read three numbers; none where a text has no three numbers."""
+def _numbers(text: str) -> tuple[float, ...]:
+    """Read three finite numbers; none where a text has others."""
     try:
-        x, y, z = map(float, text.split())
+        numbers = tuple(map(float, text.split()))
     except ValueError:
         return ()
-    if not all(map(math.isfinite, (x, y, z))):
-        raise InputError(
-            f"{path} has the {name} {text.strip()[:MAX_TEXT]}: give three finite numbers, or "
-            "remove it."
-        )
-    return x, y, z
+    return numbers if len(numbers) == 3 and all(map(math.isfinite, numbers)) else ()
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, notes: Notes = NO_NOTES) -> None:

@@ -19,7 +19,7 @@ from asysplat.geometry.motion import fit_similarity, transform
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
 
-CAMERAS = ".cameras.json"  # suffix of <scene>.cameras.json beside <scene>.ply, a transforms.json
+CAMERAS_SUFFIX = ".cameras.json"  # of <scene>.cameras.json beside <scene>.ply, a transforms.json
 MODEL = "sparse/0"  # COLMAP model in the folder <scene>/, in place of <scene>.cameras.json
 MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a fraction of their spread
 # A view shows nothing if it has Gaussians in a smaller fraction of its pixels, at a height and
@@ -66,7 +66,7 @@ class SceneFile:
 
     def _cameras(self) -> tuple[Path, NamedPoses] | None:
         """Read the cameras beside the file, if there are any: where, and names and poses."""
-        file = self.path.with_name(self.path.stem + CAMERAS)
+        file = self.path.with_name(self.path.stem + CAMERAS_SUFFIX)
         if file.is_file():
             return file, transforms.read_poses(file)
         model = self.path.with_name(self.path.stem) / MODEL
@@ -158,7 +158,7 @@ def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitte
         advice = (
             "give the cameras of this very file"
             if fitted
-            else f"put its cameras beside it, {name}{CAMERAS} or {name}/{MODEL}"
+            else f"put its cameras beside it, {name}{CAMERAS_SUFFIX} or {name}/{MODEL}"
         )
         raise InputError(
             f"{file.path}: {empty} of {cameras.num_views} test views of {file.sequence.name} show "

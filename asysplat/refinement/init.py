@@ -6,7 +6,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from asysplat.data.selection.views import evenly_spaced
+from asysplat.data.selection import evenly_spaced
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior

@@ -17,7 +17,7 @@ from asysplat.data import (
 )
 from asysplat.data.datamodule import FixedTasks, TrainingTasks, collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection.views import Selection
+from asysplat.data.selection import Selection
 from asysplat.data.sources import Task
 from asysplat.errors import InputError
 
@@ -154,6 +154,8 @@ def test_augmented_tasks_are_repeated_by_their_seed():
 
 class Counting:
     """A sequence that lists the images that were decoded."""
+
+    points = None
 
     def __init__(self, scene):
         self.scene, self.name, self.num_images = scene, scene.name, scene.num_images

@@ -10,8 +10,8 @@ from PIL import Image
 
 from asysplat.data import ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.datamodule import TrainingTasks, collate
+from asysplat.data.disparity import LEVELS, map_folder, map_name
 from asysplat.data.disparity.__main__ import main, shrink
-from asysplat.data.disparity.maps import LEVELS, map_folder, map_name
 from asysplat.data.disparity.network import DepthAnything, network_size
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError

@@ -7,7 +7,7 @@ import torch
 from asysplat.data.datamodule import SceneDataModule, TrainingTasks, collate, load
 from asysplat.data.normalize import depths_of_points
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection.views import Selection
+from asysplat.data.selection import Selection
 from asysplat.data.sources import Task
 from asysplat.scene import Cameras
 

@@ -77,13 +77,6 @@ def test_half_of_the_seeds_are_rooms_and_places_override_the_seed():
         ProceduralScene(0, 8, 8, places="caves")
 
 
-def test_sizes_that_no_memory_holds_are_refused():
-    with pytest.raises(InputError, match=r"data\.num_images is 10{30}: give at most 10,000"):
-        ProceduralScene(0, 8, 8, num_images=10**30)
-    with pytest.raises(InputError, match=r"are 8 and 10{30}: give at most 10,000,000 pixels"):
-        ProceduralScene(0, 8, 10**30)
-
-
 def test_seeds_of_splits_are_disjoint():
     seeds = [{split_seed(split, index) for index in range(300)} for split in ("train", "val")]
     seeds.append({split_seed("test", index) for index in range(300)})

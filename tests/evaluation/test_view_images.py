@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
-from asysplat.data.selection.views import Selection
+from asysplat.data.selection import Selection
 from asysplat.data.sources import Task
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError

@@ -6,7 +6,7 @@ from test_module import make_module
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection.views import uniform_selection
+from asysplat.data.selection import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
 

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from asysplat.data.check.matches import epipolar_lines
 from asysplat.data.check.report import Report
-from asysplat.data.selection.views import evenly_spaced
+from asysplat.data.selection import evenly_spaced
 from asysplat.scene import Cameras
 
 WIDTH, PATH_HEIGHT, MAX_IMAGE_HEIGHT, TITLE_HEIGHT = 12.0, 5.0, 4.5, 0.3  # inches

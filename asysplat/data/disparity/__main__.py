@@ -18,7 +18,7 @@ from rich.progress import track
 from torch.nn.functional import interpolate
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.disparity.maps import BESIDE, map_folder, map_name, write_map
+from asysplat.data.disparity import BESIDE, map_folder, map_name, write_map
 from asysplat.data.disparity.network import MODEL, load_depth_anything
 from asysplat.data.images import PANORAMA, load_image
 from asysplat.data.readers import LAYOUTS, find_scenes, read_scene

@@ -20,8 +20,6 @@ SPLITS = ("train", "val", "test")
 PLACES = ("both", "rooms", "outdoors")
 VARIED_PATHS = (arc, arc, circle, above, above, forward, pan)
 FOV, VARIED_FOV = (60, 75), (25, 80)  # range in degrees along the longer side
-MAX_IMAGES = 10_000  # along a path: the cameras of all are in memory
-MAX_PIXELS = 10_000_000  # of an image, whose rays are all in memory
 CPU_CHUNK = 4096  # rays traced at once on a CPU, so that they stay in its cache
 PROBE_IMAGES = 4  # images that set the exposure
 PROBE_SIZE = 16  # pixels a side of those images
@@ -56,6 +54,8 @@ class ProceduralScene:
             paths, and focal lengths from wide to long.
     """
 
+    points = None  # of its surfaces, which depths show
+
     def __init__(
         self,
         seed: int,
@@ -68,13 +68,6 @@ class ProceduralScene:
     ):
         if places not in PLACES:
             raise InputError(f"data.places is {places!r}: expected one of {', '.join(PLACES)}.")
-        if num_images > MAX_IMAGES:
-            raise InputError(f"data.num_images is {num_images}: give at most {MAX_IMAGES:,}.")
-        if height * width > MAX_PIXELS:
-            raise InputError(
-                f"data.height and data.width are {height} and {width}: give at most "
-                f"{MAX_PIXELS:,} pixels."
-            )
         rng = np.random.default_rng(seed)
         self.name = f"{'procedural' if places == 'both' else places}-{seed}"
         self.num_images = num_images

@@ -18,7 +18,7 @@ from types import ModuleType
 
 from asysplat.data import frames
 from asysplat.data.bad_images import BadImages
-from asysplat.data.disparity.maps import with_disparities
+from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
     colmap,
     dl3dv,

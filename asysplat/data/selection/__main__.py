@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 
 from asysplat.data.readers import find_scenes, open_scene
-from asysplat.data.selection import SELECTIONS, named_selection
+from asysplat.data.selection import SELECTIONS, Selection, named_selection
 from asysplat.data.selection.index import write_index
-from asysplat.data.selection.views import Selection
 from asysplat.data.sequence import SceneOptions
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from asysplat.data.readers.common import folders_with, read_frames
-from asysplat.data.selection.views import Selection
+from asysplat.data.selection import Selection
 from asysplat.errors import InputError
 from asysplat.files import read_json
 
+KEYS = ("context", "target")  # of pixelSplat's form
 LONG_LRM_FILE = "opencv_cameras.json"
 LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")
 
@@ -46,23 +47,15 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
             )
         return dict(_long_lrm_entry(file, read_frames(file), num_inputs) for file in files)
     content = read_json(path)
-    if isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
+    if isinstance(content, list):
         return dict(_long_lrm_entry(path, entry, num_inputs) for entry in content)
-    if not isinstance(content, dict):
-        raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
-    if isinstance(content.get("frames"), list):
+    if "frames" in content:
         return dict([_long_lrm_entry(path, content, num_inputs)])
-    # Our command once wrote the scenes beside a hash.
-    old = "hash" in content and isinstance(content.get("scenes"), dict)
-    scenes = content["scenes"] if old else content
-    index = {}
-    for name, stored in scenes.items():
-        if stored is not None:
-            entry = stored if isinstance(stored, dict) else {}
-            where = f"{path}, scene {name}"
-            lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
-            index[name] = Entry(*lists)
-    return index
+    return {
+        name: Entry(*(_indices(f"{path}, scene {name}, {key}", stored.get(key)) for key in KEYS))
+        for name, stored in content.items()
+        if stored is not None
+    }
 
 
 def select_from_index(
@@ -111,7 +104,6 @@ def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tup
 
 
 def _indices(where: str, stored: Any) -> list[int]:
-    valid = isinstance(stored, list) and stored and all(type(n) is int and n >= 0 for n in stored)
-    if not valid or len(set(stored)) != len(stored):
+    if not stored or len({*stored}) != len(stored) or min(stored) < 0:
         raise InputError(f"{where} is {stored!r}: give a list of different image numbers from 0.")
     return stored

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
-from asysplat.data.cameras import CameraOptions, refine_cameras, refine_given
-from asysplat.data.cameras.choose import LEAST_FEATURES
+from asysplat.data.cameras import LEAST_FEATURES, CameraOptions, refine_cameras, refine_given
 from asysplat.data.cameras.refine import LEAST_OF_LENS, LEAST_POINTS
 from asysplat.data.photographs import open_photographs
 from asysplat.data.write import write_transforms

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from asysplat.data import SceneOptions, open_scene
 from asysplat.data.bad_images import BadImages
-from asysplat.data.cameras.choose import CameraOptions, refine_given
+from asysplat.data.cameras import CameraOptions, refine_given
 from asysplat.data.check.report import check_scene
 from asysplat.data.images import PANORAMA, undistort
 from asysplat.data.photographs import open_photographs
