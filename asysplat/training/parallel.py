@@ -11,17 +11,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, reduce
-from typing import Any
 
 import torch
 from lightning.pytorch.strategies import ModelParallelStrategy
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from asysplat.data.datamodule import Batch
 from asysplat.rendering import Rendering
 from asysplat.scene import Gaussians
 
-Batch = dict[str, Any]
 Terms = dict[str, Tensor]
 
 
@@ -113,10 +112,13 @@ class ShardedStrategy(ModelParallelStrategy):
 
 def split(batch: Batch) -> list[Batch]:
     """Split a batch into batches of one scene."""
-    scenes = [{"scene": [scene]} for scene in batch["scene"]]
-    for index, scene in enumerate(scenes):
-        for name in ("inputs", "targets"):
-            scene[name] = batch[name].map(lambda tensor, i=index: tensor[i, None])
+    scenes = []
+    for index, scene in enumerate(batch["scene"]):
+        inputs, targets = (
+            views.map(lambda tensor, i=index: tensor[i, None])
+            for views in (batch["inputs"], batch["targets"])
+        )
+        scenes.append({**batch, "scene": [scene], "inputs": inputs, "targets": targets})
     return scenes
 
 

@@ -6,7 +6,6 @@ network if the data has it (`python -m asysplat.data.disparity`), else the inver
 """
 
 import math
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.scene import Gaussians, Views, inverse_depths
-from asysplat.training.parallel import Prediction
+from asysplat.training.parallel import Batch, Prediction
 
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEVIATION = 0.1  # of the median disparity
@@ -43,7 +42,7 @@ class RenderedDisparity:
     def __init__(self, stride: int | None = None):
         self.stride = stride
 
-    def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
+    def __call__(self, prediction: Prediction, batch: Batch) -> Float[Tensor, ""] | None:
         """Compute the term; None if the targets have neither disparities nor depths."""
         rendering, target = prediction.rendering, reference_disparities(batch["targets"])
         if target is None:
@@ -65,7 +64,7 @@ class InputDisparity:
     renders_depth = False
     missing = NO_DISPARITIES
 
-    def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
+    def __call__(self, prediction: Prediction, batch: Batch) -> Float[Tensor, ""] | None:
         """Compute the term; None if the inputs have neither disparities nor depths."""
         inputs, target = batch["inputs"], reference_disparities(batch["inputs"])
         if target is None:
@@ -82,7 +81,7 @@ class LogDepth:
     renders_depth = False
     missing = NO_DEPTHS
 
-    def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
+    def __call__(self, prediction: Prediction, batch: Batch) -> Float[Tensor, ""] | None:
         """Compute the mean over scenes of the mean absolute difference; None without depths."""
         inputs = batch["inputs"]
         if inputs.depths is None:

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -11,7 +10,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import ssim
 from asysplat.training.losses.disparity import InputDisparity, LogDepth, RenderedDisparity
 from asysplat.training.losses.perceptual import PerceptualDistance, vgg16
-from asysplat.training.parallel import Prediction
+from asysplat.training.parallel import Batch, Prediction
 
 
 class SplattingLoss(nn.Module):
@@ -70,7 +69,7 @@ class SplattingLoss(nn.Module):
         """Whether the loss needs rendered depth."""
         return self._depth_term is not None and self._depth_term.renders_depth
 
-    def forward(self, prediction: Prediction, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def forward(self, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """Compute the weighted sum, as "loss", and each term that is on, unweighted."""
         targets = batch["targets"]
         terms, image = {}, targets.masked(prediction.rendering.image)
