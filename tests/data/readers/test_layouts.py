@@ -9,7 +9,9 @@ import torch
 from layouts import assert_listed, assert_same, cut, opener, save_depth
 
 from asysplat.data import find_scenes
+from asysplat.errors import InputError
 
+CUT = (".json", ".npy", ".txt", ".bin", ".torch")  # files of cameras and points
 NAMES = [module.name for module in iter_modules(layouts.__path__)]
 FILES = [name for name in NAMES if name != "realestate10k"]  # which has images inside a file
 DEPTHS = [name for name in NAMES if getattr(import_module(f"layouts.{name}"), "HAS_DEPTHS", True)]
@@ -35,32 +37,30 @@ def test_every_layout_gives_the_same_views(name, views, centered_views, tmp_path
     assert read.masks is None or bool(read.masks.all())
 
 
-DAMAGES = {
-    "missing": (lambda file: file.unlink(), "does not exist"),
-    "cut": (cut, "cannot be read as an image"),
-    "empty": (lambda file: file.write_bytes(b""), "is empty (0 bytes)"),
-}
-SQUARE = (lambda file: save_depth(file, torch.ones(8, 8)), "is 8 x 8 and the image 32 x 24")
+@pytest.mark.parametrize("name", NAMES)
+def test_half_of_a_file_is_a_sentence(name, few, tmp_path):
+    root = import_module(f"layouts.{name}").write(few, tmp_path)
+    files = [path for path in tmp_path.rglob("*.*") if path.suffix in CUT and path.is_file()]
+    assert files
+    for file in files:
+        stored = file.read_bytes()
+        cut(file, len(stored) // 2)
+        with pytest.raises(InputError, match=r"/.* (cannot|holds|is|has|names) "):
+            _ = opener(name)(find_scenes(root, name)[1][0]).scene.points
+        file.write_bytes(stored)
 
 
-# Readers of llff and posed check the number of images first.
-CASES = [
-    (name, damage)
-    for name in FILES
-    for damage in DAMAGES
-    if damage != "missing" or name not in ("llff", "posed")
-]
+@pytest.mark.parametrize("name", FILES)
+def test_an_image_that_is_cut_short_is_named_or_left_out(name, few, tmp_path):
+    check_damage(name, few, tmp_path, "file", cut, "cannot be read as an image")
 
 
-@pytest.mark.parametrize("name, damage", CASES)
-def test_a_damaged_image_is_named_or_left_out(name, damage, few, tmp_path):
-    check_damage(name, few, tmp_path, "file", *DAMAGES[damage])
-
-
-@pytest.mark.parametrize("damage", [*DAMAGES, "square"])
 @pytest.mark.parametrize("name", DEPTHS)
-def test_a_damaged_depth_map_is_named_or_left_out(name, damage, few, tmp_path):
-    check_damage(name, few, tmp_path, "depth", *(DAMAGES | {"square": SQUARE})[damage])
+def test_a_depth_map_of_other_proportions_is_named_or_left_out(name, few, tmp_path):
+    def square(file):
+        save_depth(file, torch.ones(8, 8))
+
+    check_damage(name, few, tmp_path, "depth", square, "is 8 x 8 and the image 32 x 24")
 
 
 def check_damage(name, views, folder, field, damage, message):

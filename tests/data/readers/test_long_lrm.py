@@ -1,5 +1,5 @@
 import pytest
-from layouts import assert_listed, assert_same, cut, edit_json, opener
+from layouts import assert_listed, assert_same, edit_json, opener
 from layouts import long_lrm as layout
 
 from asysplat.data import find_scenes
@@ -79,10 +79,7 @@ def test_all_bad_images_are_listed_or_left_out(scene):
     assert names_of(sequence) == [f"frame{10 * index}.png" for index in (0, 1, 3, *range(7, 12))]
 
 
-def test_a_cut_or_missing_json_is_refused(scene, listed):
-    cut(scene / "opencv_cameras.json", 1000)
-    with pytest.raises(InputError, match=r"opencv_cameras\.json is not JSON"):
-        opened(scene)
+def test_a_list_that_names_a_missing_json_is_refused(listed):
     listed.write_text("gone/opencv_cameras.json")
     with pytest.raises(InputError, match=r"gone/opencv_cameras\.json does not exist"):
         opened(listed)
