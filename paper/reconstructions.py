@@ -40,8 +40,8 @@ class Reconstruction(NamedTuple):
     """A finished reconstruction."""
 
     folder: Path
-    results: dict[str, Any]  # of metrics.json
-    options: dict[str, Any]  # of config.yaml, by dotted keys
+    results: dict[str, Any]  # content of metrics.json
+    options: dict[str, Any]  # content of config.yaml, by dotted keys
 
 
 def report_reconstructions(folder: Path, output: Path | None = None) -> None:

@@ -34,7 +34,7 @@ class BadImages:
             yield
         except InputError as error:
             self.errors.append(str(error))
-        except (LookupError, TypeError, ValueError) as error:  # of a file that lacks something
+        except (LookupError, TypeError, ValueError) as error:  # a file that lacks something
             self.errors.append(f"{name} cannot be read ({brief(error)}).")
 
     def read_each(

@@ -13,7 +13,6 @@ from asysplat.files import atomic_write, read_json
 from asysplat.terminal import make_console, print_table
 
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
-RESIDUAL = f"{TESTED}residual"  # largest error of cameras that were fitted to their scenes
 Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 
 # Title of a row: prefix of its keys, with a place for the test set.

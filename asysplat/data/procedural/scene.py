@@ -54,7 +54,7 @@ class ProceduralScene:
             paths, and focal lengths from wide to long.
     """
 
-    points = None  # of its surfaces, which depths show
+    points = None  # no sparse points: depths show the surfaces
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
             _check_whole(model / name)
     try:
         colmap = _read(model)
-    except Exception as error:  # of any kind, from IndexError to MemoryError
+    except Exception as error:  # errors of any kind, from IndexError to MemoryError
         reason = str(error).split("\n")[0]
         if reason == "Camera model does not exist":
             raise InputError(

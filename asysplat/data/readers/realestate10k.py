@@ -96,7 +96,7 @@ def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
         scenes = torch.load(
             chunk, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(chunk)
         )
-    except Exception as error:  # of any kind, from EOFError to RuntimeError
+    except Exception as error:  # errors of any kind, from EOFError to RuntimeError
         raise InputError(
             f"{chunk} cannot be read as tensors alone ({brief(error)}): copy it again."
         ) from error

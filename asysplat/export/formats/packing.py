@@ -15,6 +15,7 @@ from asysplat.geometry.spherical_harmonics import sh_basis
 from asysplat.scene import Gaussians
 
 MORTON_BITS = 21  # of each coordinate; three fit into 64
+TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that round to 0
 GENERIC_DIRECTION = (0.36, 0.48, 0.8)  # no SH function up to degree 3 is 0 along it
 
 
@@ -89,9 +90,6 @@ def half_turn(gaussians: Gaussians, axis: int) -> Gaussians:
     )
 
 
-TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that round to 0
-
-
 @contextmanager
 def reading(path: str | Path, kind: str) -> Generator[Path]:
     """Yield the path of a file; errors inside become a sentence that begins with it.
@@ -105,6 +103,8 @@ def reading(path: str | Path, kind: str) -> Generator[Path]:
         yield path
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except MemoryError:  # a large file, not a damaged one
+        raise
     except Exception as error:
         reason = f"{path} cannot be read as {kind} ({brief(error)})"
         raise InputError(f"{reason}: it is cut short or of another format.") from error

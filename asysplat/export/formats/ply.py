@@ -146,7 +146,7 @@ def _read_header(file: BinaryIO) -> tuple[str, list[tuple[str, int, dict[str, st
                 elements.append((name, int(count), {}))
             case ["property", kind, name]:
                 elements[-1][2][name] = TYPES[kind]
-            case ["property", "list", _, _, name]:  # of faces, which follow the vertices
+            case ["property", "list", _, _, name]:  # lists of faces, which follow the vertices
                 elements[-1][2][name] = "O"
             case words:
                 raise InputError(f"{' '.join(words)[:80] or 'its end'!r} stands in its header.")

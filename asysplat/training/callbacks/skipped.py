@@ -21,7 +21,7 @@ class NonFiniteSteps(Callback):
     def __init__(self, budget: int = 10):
         self.budget = budget
         self.count, self.in_a_row = 0, 0
-        self.scenes: list[str] = []  # of the step's micro-batches
+        self.scenes: list[str] = []  # names in the step's micro-batches
         self.buffers: list[Tensor] = []  # copies from before the step
 
     def state_dict(self) -> dict[str, Any]:
