@@ -1,23 +1,21 @@
 """Signals of scripts: Ctrl-C, the end of a terminal session, and those of a scheduler."""
 
+import math
 import os
 import signal
 import stat
-import sys
-import threading
+import time
 from types import FrameType
 
-DELAY = 0.01  # seconds until the callback has returned
-_interrupted = False  # by _interrupt
+MIN_SECONDS = 1.0  # between two interrupts
 
 
 def handle_signals() -> None:
     """Set the signal handlers of a script; call it after its imports.
 
     SIGTERM ends the process without the stack trace that pycolmap would print. SIGHUP, of a
-    terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`). Interrupts are kept.
+    terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`).
     """
-    keep_interrupts()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _hang_up)
@@ -37,37 +35,15 @@ def end_at_interrupt() -> None:
 
 
 def interrupt_once() -> None:
-    """Raise KeyboardInterrupt at the first Ctrl-C only, as training then saves and ends."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _interrupt)
+    """Raise KeyboardInterrupt at a Ctrl-C, and ignore others for MIN_SECONDS, while a run ends."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        return
+    last = -math.inf
 
+    def interrupt(*_: object) -> None:
+        nonlocal last
+        previous, last = last, time.monotonic()
+        if last - previous > MIN_SECONDS:
+            raise KeyboardInterrupt
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    global _interrupted
-    if not _interrupted:
-        _interrupted = True
-        raise KeyboardInterrupt
-
-
-def keep_interrupts() -> None:
-    """Repeat a KeyboardInterrupt that Python can only print.
-
-    In a finalizer, or a callback of C code (such as Numba's when it loads a kernel), Python prints
-    exceptions and continues: Ctrl-C at such a moment would be lost.
-    """
-    previous, main = sys.unraisablehook, threading.main_thread().ident
-    timer: threading.Timer | None = None
-
-    def repeat(ignored: "sys.UnraisableHookArgs") -> None:
-        nonlocal timer
-        global _interrupted
-        if not isinstance(ignored.exc_value, KeyboardInterrupt):
-            previous(ignored)
-            return
-        _interrupted = False
-        # No thread can start at the end of the process.
-        if not (timer and timer.is_alive()) and not sys.is_finalizing():
-            timer = threading.Timer(DELAY, signal.pthread_kill, (main, signal.SIGINT))
-            timer.start()
-
-    sys.unraisablehook = repeat
+    signal.signal(signal.SIGINT, interrupt)
