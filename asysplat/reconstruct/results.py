@@ -33,8 +33,6 @@ from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.terminal import make_console, print_table
 
-BYTES_PER_GAUSSIAN = 4 * 62  # size in one of the files, at most
-OTHER_BYTES = 20_000_000  # space for the figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
 
 
@@ -76,10 +74,7 @@ class Results:
         """
         cameras = photographs.inputs.cameras
         self._protocol.check_size(cameras.height, cameras.width)
-        count = max(gaussians.num_gaussians, self._config.refinement.max_gaussians or 0)
-        self.folder = new_folder(
-            self.folder, OTHER_BYTES + len(self._suffixes) * count * BYTES_PER_GAUSSIAN
-        )
+        self.folder = new_folder(self.folder)
         self._photographs, self._background = photographs, background
         if self._lpips is not None:
             self._lpips.to(background.device)
