@@ -6,7 +6,7 @@ from lightning.pytorch.callbacks import RichProgressBar
 from tiny import QUIET, OneLayer
 from torch.utils.data import DataLoader
 
-from asysplat.training.callbacks import progress
+from asysplat.training import loggers
 
 
 class Module(OneLayer):
@@ -34,7 +34,7 @@ def fit(tmp_path, steps, checkpoint=None):
         max_steps=steps,
         max_epochs=-1,
         num_sanity_val_steps=0,
-        callbacks=[progress.ProgressLines()],
+        callbacks=[loggers.ProgressLines()],
         enable_checkpointing=False,
         default_root_dir=tmp_path,
     )
@@ -59,13 +59,13 @@ def test_lines_after_each_validation_without_a_terminal(tmp_path, capsys):
 
 
 def test_lines_between_validations(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0)
+    monkeypatch.setattr(loggers, "LINE_SECONDS", 0)
     fit(tmp_path, 2)
     steps = [line.split(",")[0].split(":")[0] for line in lines(capsys.readouterr().out)]
     assert steps == ["step 1 of 2", "step 2 of 2", "step 2 of 2"]  # the last after the validation
 
 
 def test_bars_on_a_terminal_alone(monkeypatch):
-    assert isinstance(progress.show_progress(), progress.ProgressLines)
-    monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: True)
-    assert isinstance(progress.show_progress(), RichProgressBar)
+    assert isinstance(loggers.show_progress(), loggers.ProgressLines)
+    monkeypatch.setattr(loggers.sys.stdout, "isatty", lambda: True)
+    assert isinstance(loggers.show_progress(), RichProgressBar)

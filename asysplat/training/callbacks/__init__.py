@@ -1,11 +1,10 @@
-"""Callbacks: metrics, costs, figures, bad scenes, non-finite steps, checkpoints, progress."""
+"""Callbacks: metrics, costs, figures, bad scenes, non-finite steps, checkpoints."""
 
 from asysplat.training.callbacks.checkpoints import Checkpoints, StageRecord
 from asysplat.training.callbacks.costs import Costs
 from asysplat.training.callbacks.figures import Curve, Figures
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
-from asysplat.training.callbacks.progress import show_progress
 from asysplat.training.callbacks.skipped import BadScenes, NonFiniteSteps
 
 __all__ = [
@@ -18,5 +17,4 @@ __all__ = [
     "NonFiniteSteps",
     "StageRecord",
     "TrainingMonitor",
-    "show_progress",
 ]
