@@ -1,5 +1,6 @@
 """An override must name what exists; otherwise one sentence names the nearest that does."""
 
+import itertools
 import re
 import shlex
 import subprocess
@@ -132,11 +133,23 @@ def test_every_printed_command_names_what_is_there(repository, request):
     GlobalHydra.instance().clear()
     request.addfinalizer(GlobalHydra.instance().clear)
     initialize_config_dir(str(CONF), version_base="1.3")  # once for all
+    together: dict[tuple, dict[str, str]] = {}  # options of commands with the same choices
     for script, given in printed:
         words = shlex.split(given)
         if script == "reconstruct":  # its photographs, and switches
             words = [word for word in words if word not in ("my_scene", "--view", "--open")]
-        check_overrides(get_args_parser().parse_args(words).overrides, script)
+        options = {
+            word.lstrip("+~").partition("=")[0]: word
+            for word in get_args_parser().parse_args(words).overrides
+        }
+        choices = {word for key, word in options.items() if (CONF / key.split("@")[0]).is_dir()}
+        for number in itertools.count():
+            others = together.setdefault((script, *sorted(choices), number), {})
+            if all(others.get(key, word) == word for key, word in options.items()):
+                others.update(options)
+                break
+    for (script, *_), options in together.items():
+        check_overrides(options.values(), script)
 
 
 def test_printed_commands_with_the_shipped_weights_have_their_model(repository):
