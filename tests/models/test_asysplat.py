@@ -196,6 +196,16 @@ def test_views_exchange_only_through_the_geometry_branch(build):
     assert change("model/fusion=fine", "model/links=only_fine_to_coarse") == 0
 
 
+def test_both_links_of_a_stage_read_the_tokens_before_the_exchange(build):
+    """Eq. 3."""
+    net, read = build("model=asysplat_4m4s", *TINY), []
+    for link in (net.geometry.links[0], net.appearance.links[0]):
+        link.register_forward_pre_hook(lambda _, tokens: read.append(tokens))
+    net(make_views())
+    (coarse, fine), (fine_too, coarse_too) = read
+    assert coarse_too is coarse and fine_too is fine
+
+
 def test_bfloat16_autocast_keeps_gaussians_in_fp32(build):
     views = make_views()
     net = build(*TINY).eval()

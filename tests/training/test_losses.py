@@ -12,6 +12,7 @@ from torchvision.models import vgg16 as torchvision_vgg16
 from torchvision.models import vgg19 as torchvision_vgg19
 
 from asysplat.errors import InputError
+from asysplat.evaluation.metrics import ssim
 from asysplat.rendering import Rendering
 from asysplat.runs.runs import config_hash
 from asysplat.scene import Cameras, Gaussians, Views
@@ -261,6 +262,14 @@ def test_a_missing_network_turns_the_term_off_or_is_refused(
 def test_a_loss_without_any_term_is_refused():
     with pytest.raises(InputError, match=r"training\.loss has no term that is on"):
         make_loss(mse=0.0, ssim=0.0, perceptual=0.0, depth=0.0)
+
+
+def test_the_ssim_term_is_what_ssim_lacks_of_1():
+    prediction, batch = pair()
+    terms = make_loss(mse=0.5, ssim=2.0)(prediction, batch)
+    image, targets = prediction.rendering.image, batch["targets"].images
+    assert terms["ssim"] == 1 - ssim(image, targets).mean() and terms["ssim"] > 0.5
+    assert terms["loss"] == 0.5 * F.mse_loss(image, targets) + 2 * terms["ssim"]
 
 
 def test_what_ran_is_described(distances):
