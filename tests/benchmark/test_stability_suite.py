@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import replace
 from importlib import import_module
-from io import StringIO
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from rich.console import Console
 from asysplat.errors import InputError
 from asysplat.models import head
 from benchmarks.stability.comparison import StabilityCase, compare_to_reference, unit_roundoff
-from benchmarks.stability.hostile import HOSTILE_GAUSSIANS, hostile_views
+from benchmarks.stability.hostile import HOSTILE_GAUSSIANS
 from benchmarks.stability.report import AREAS, measure, plot, tables, verdict
 
 TINY = {"scale": "laptop", "width": 0.125, "state_size": 8, "model.layers": "1m1s"}
@@ -55,8 +54,8 @@ def cubed(tensors):
     return {"y": tensors["x"] ** 3}
 
 
-def compare(fast, **inputs):
-    return compare_to_reference(fast, cubed, inputs or {"x": torch.rand(9) + 1}, ("x",))
+def compare(fast):
+    return compare_to_reference(fast, cubed, {"x": torch.rand(9) + 1}, ("x",))
 
 
 def test_rounding_is_green_and_more_is_red():
@@ -65,10 +64,10 @@ def test_rounding_is_green_and_more_is_red():
         assert not compare(lambda t: {"y": factor * cubed(t)["y"]})["green"]  # noqa: B023
     nearly = compare(lambda t: {"y": (1 + 4 * unit_roundoff(torch.float32)) * cubed(t)["y"]})
     assert nearly["green"] and nearly["error"] > unit_roundoff(torch.float32)
+    assert nearly["tolerance"] < 1e-5
 
 
-def test_tolerances_grow_with_the_condition_number():
-    """A difference of nearly equal numbers has few correct digits."""
+def test_a_difference_of_nearly_equal_numbers_has_a_larger_tolerance():
     inputs = {"x": torch.tensor([1.0, 2.0]), "z": torch.tensor([1.00001, 2.00002])}
 
     def difference(tensors):
@@ -76,7 +75,6 @@ def test_tolerances_grow_with_the_condition_number():
 
     row = compare_to_reference(difference, difference, inputs)
     assert row["green"] and row["tolerance"] > 0.05
-    assert compare(cubed)["tolerance"] < 1e-5
 
 
 @pytest.mark.parametrize("value, count", [(math.nan, "nan"), (math.inf, "inf")])
@@ -86,15 +84,9 @@ def test_non_finite_numbers_are_red_and_counted(value, count):
     assert row["error"] is row["tolerance"] is None
 
 
-def test_hostile_views_are_valid():
-    for hostile in hostile_views().values():
-        replace(hostile, count=3).views().validate()
-
-
 @pytest.mark.medium
 def test_a_small_page_is_green(options):
-    console = Console(width=300, file=StringIO())
-    results = {"machine": {"cpu": "some"}, **measure(options, console)}
+    results = {"machine": {"cpu": "some"}, **measure(options, Console(quiet=True))}
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert verdict(results) is None
     areas = [row["area"] for row in results["rows"]]
@@ -103,10 +95,6 @@ def test_a_small_page_is_green(options):
     for row in results["rows"]:
         assert row["green"], row
         assert row["area"] != "renderer" or 0 <= row["error"] <= row["tolerance"], row
-    for table in tables(results):
-        console.print(table)
-    shown = console.file.getvalue()
-    assert f"all {len(areas)} cases are green" in shown and "RED" not in shown
     assert sum(table.row_count for table in tables(results)[1:]) == len(areas)
     assert plot(results).axes
 
@@ -120,7 +108,6 @@ def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypa
     assert "red: 1 of 1 cases are not stable: prior: dark (fp32)" in done.stderr
     assert "raised ZeroDivisionError" in (tmp_path / "stability.md").read_text()
     assert json.loads((tmp_path / "stability.json").read_text())["rows"][0]["green"] is False
-    assert (tmp_path / "stability.png").stat().st_size > 0
 
 
 @pytest.mark.medium
@@ -153,12 +140,5 @@ def test_a_nan_gradient_is_red(measured, monkeypatch):
 
 
 def test_unknown_options_are_named(options):
-    wrong = {
-        r"^stability\.areas=weather is unknown: .*operators, prior": {"areas": ["weather"]},
-        r"^stability\.views=\[0\] cannot be": {"views": [0]},
-        r"^stability\.training_steps=1.5 cannot be": {"training_steps": 1.5},
-        "nothing": {"models": ["nothing"]},
-    }
-    for sentence, changes in wrong.items():
-        with pytest.raises(InputError, match=sentence):
-            measure(OmegaConf.merge(options, {"stability": changes}), Console(file=StringIO()))
+    with pytest.raises(InputError, match=r"^stability\.areas=weather is unknown: .*operators, pr"):
+        measure(OmegaConf.merge(options, {"stability": {"areas": ["weather"]}}), Console())
