@@ -110,7 +110,7 @@ def test_means_are_over_scenes_and_dominated_points_are_not_on_the_curve():
     means = {row["setting"]: row for row in average_scenes(rows)}
     quick = means["quick"]
     assert (quick["scenes"], quick["seconds"], quick["psnr"]) == (2, 2.5, 24.25)
-    assert quick["over_base"] == pytest.approx(0.5)  # geometric
+    assert quick["over_base"] == pytest.approx(0.5)  # the geometric mean
     assert (quick["lost"], quick["error"]) == (0.75, 35.0)
     assert means["absent"]["scenes"] == 0 and means["absent"]["psnr"] is None
 

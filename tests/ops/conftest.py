@@ -1,4 +1,4 @@
-"""Every stress case of the scans runs on every path: a scan and one of its backends."""
+"""Every case of the scans runs on every path: a scan and one of its backends."""
 
 import pytest
 from scans import PATHS

@@ -46,10 +46,7 @@ def make_arguments(
 ) -> tuple[Tensor, ...]:
     """x, dt, A, B, C, D: x, B and C in `dtype`, the others in float32.
 
-    Args:
-        steps, rates: dt and -A: a number, from half to one and a half of which they are drawn, or
-            a name of STEPS or RATES.
-        channels: heads, for ssd; each of `head_dim`.
+    dt and -A are drawn from half to one and a half of a number, or are a name of STEPS or RATES.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -81,7 +78,6 @@ def both_ways(
     grad_output: Tensor | None = None,
     reverse: bool = False,
 ) -> Result:
-    """Run a backend forward and backward from `grad_output`, by default a random one."""
     name, backend = path
     leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
     y = SCANS[name](*leaves, backend=backend, reverse=reverse)
@@ -96,10 +92,7 @@ def by_loop(
     reverse: bool = False,
     dtype: torch.dtype = torch.float64,
 ) -> Result:
-    """The same by a loop over the tokens, with gradients by hand: exact in float64, at any length.
-
-    In float32 it shows the error of a plain loop on a badly conditioned case.
-    """
+    """The same by a loop over the tokens, with gradients by hand."""
     x, dt, A, B, C, D = (argument.detach().to(dtype) for argument in arguments)
     grad_output = random_grad_output(arguments[0]) if grad_output is None else grad_output
     grad_output = grad_output.to(dtype)
@@ -156,7 +149,6 @@ def _loop(x, dt, A, B, C, D, grad_output):
 
 
 def relative_error(value: Tensor, exact: Tensor) -> float:
-    """L2."""
     value, exact = value.detach().double(), exact.detach().double()
     return float((value - exact).norm() / exact.norm().clamp(min=UNDERFLOW))
 
@@ -181,12 +173,7 @@ def assert_exact(
     reverse: bool = False,
     slack: float = 0,
 ) -> None:
-    """Check that the output and all gradients are finite and within the allowed error.
-
-    Args:
-        slack: for badly conditioned cases: an error up to so many times that of the loop in
-            float32 passes, too.
-    """
+    """An error up to `slack` times that of the loop in float32 passes, too."""
     result = both_ways(path, arguments, grad_output, reverse)
     for name, value in result.named().items():
         assert value.isfinite().all(), name

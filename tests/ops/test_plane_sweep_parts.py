@@ -42,10 +42,15 @@ def wall(halved=(), trust=None):
 
 
 def check_wall(halved=(), trust=None):
-    """Compare the depths of a wall between all views."""
     inverse, *rest = wall(halved, trust)
     steps = torch.zeros(1, 4, dtype=torch.float64)
     return load_backend("auto", inverse).consistency(inverse, steps, *rest)
+
+
+def opacity(inverse, votes, confidence):
+    views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
+    estimate = DepthEstimate(inverse, confidence * torch.ones_like(inverse), votes)
+    return Prior.from_estimate(estimate, views, inverse.shape[-2:]).opacity
 
 
 def test_all_views_agree_on_a_wall():
@@ -73,20 +78,15 @@ def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(m
 
 
 def test_what_three_views_see_through_is_in_free_space_and_hardly_opaque():
-    inverse, *rest = wall(halved=[3])
-    votes = count_votes(inverse, *rest)
+    inverse, trust, others, projections = wall(halved=[3])
+    votes = count_votes(inverse, trust, others, projections)
     free = in_free_space(votes)
     assert free[:, 3, 4:-4, 12:-12].all() and not free[:, :3].any()
-    estimate = DepthEstimate(inverse, torch.ones_like(inverse), votes)
-    views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
-    opacity = Prior.from_estimate(estimate, views, (CAMERAS.height, CAMERAS.width)).opacity
-    assert (opacity[free] == FREE_OPACITY).all() and opacity[~free].min() > 0.4
-
-
-def test_what_one_other_view_denies_or_none_sees_is_kept():
-    inverse, trust, _, projections = wall(halved=[3])
-    for others in ([[1, -1, -1]] * 3 + [[0, -1, -1]], [[-1, -1, -1]] * 4):
-        votes = count_votes(inverse, trust, torch.tensor([others]), projections)
+    opacities = opacity(inverse, votes, confidence=1)
+    assert (opacities[free] == FREE_OPACITY).all() and opacities[~free].min() > 0.4
+    # What one other view denies, or none sees, is kept.
+    for few in ([[1, -1, -1]] * 3 + [[0, -1, -1]], [[-1, -1, -1]] * 4):
+        votes = count_votes(inverse, trust, torch.tensor([few]), projections)
         assert not in_free_space(votes).any()
 
 
@@ -95,13 +95,7 @@ def test_views_from_which_a_point_is_hidden_leave_it_its_opacity():
     inverse, *rest = wall(halved=[3])
     votes, clear = count_votes(inverse, *rest), count_votes(*wall())
     assert (votes.occluding[:, :3][INNER] == 1).all() and not votes.occluding[:, 3].any()
-    views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
-    hidden, seen = (
-        Prior.from_estimate(
-            DepthEstimate(inverse, torch.zeros_like(inverse), each), views, inverse.shape[-2:]
-        ).opacity
-        for each in (votes, clear)
-    )
+    hidden, seen = (opacity(inverse, each, confidence=0) for each in (votes, clear))
     assert (hidden > seen)[:, :3][INNER].all()
 
 
@@ -114,14 +108,6 @@ def test_no_neighbor_sees_no_depth():
         inverse_depth_range(cameras, projections, chosen) for chosen in (padded, padded[..., :1])
     )
     assert torch.equal(found, expected) and (found[..., 1] > 0).all()
-
-
-@pytest.mark.parametrize("views", [1, 2, 5])
-def test_other_views_are_all_but_itself(views):
-    others = other_views(views, 2, torch.device("cpu"))
-    assert len(others) == 2
-    for view, found in enumerate(others[1].tolist()):
-        assert sorted(found) == ([v for v in range(views) if v != view] or [-1])
 
 
 def test_a_range_ignores_outliers():
@@ -143,13 +129,10 @@ def test_the_second_sweep_has_planes_where_surfaces_are():
     assert error.median() < 0.02
 
 
-@pytest.mark.parametrize("size", [(12, 18), (6, 9), (5, 7), (1, 1)], ids=str)
-def test_smaller_images_are_means_over_areas(size):
+def test_smaller_images_are_means_over_areas_and_edges_are_color_changes():
     images = torch.rand(2, 3, 12, 18, dtype=torch.float64)
-    torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))
-
-
-def test_edges_are_color_changes():
+    for size in ((12, 18), (6, 9), (5, 7), (1, 1)):
+        torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))
     images = torch.zeros(1, 1, 3, 4, 5)
     images[..., 2:] = torch.tensor([0.3, 0.6, 0.9])[:, None, None]
     left, above = edges(images)[0, 0]
