@@ -65,16 +65,16 @@ def both_ways(
     inputs: tuple[str, ...] = INPUTS,
     **options,
 ) -> Result:
-    """Render in the backend's float type, forward and backward.
+    """Render in the backend's float type, and compute the gradients of `inputs`.
 
-    `grad_output` returns the gradient of an output from its name and value, None if it is unused;
-    the default is random, the same every time. Of the leaves only `inputs` need gradients.
+    `grad_output` returns the gradient of an output from its name and value, None if it is unused.
     """
-    leaves = {name: getattr(gaussians, name) for name in FIELDS}
-    leaves |= {"cam_to_world": cameras.cam_to_world, "intrinsics": cameras.intrinsics}
-    leaves["background"] = background
-    leaves = {k: t.detach().to(backend.dtype).clone() for k, t in leaves.items()}
-    leaves |= {name: leaves[name].requires_grad_() for name in inputs}
+    leaves = [getattr(gaussians, name) for name in FIELDS]
+    leaves += [cameras.cam_to_world, cameras.intrinsics, background]
+    leaves = [leaf.detach().to(backend.dtype, copy=True) for leaf in leaves]
+    leaves = dict(zip(INPUTS, leaves, strict=True))
+    for name in inputs:
+        leaves[name].requires_grad_()
     out = render(
         Gaussians(*(leaves[name] for name in FIELDS)),
         replace(cameras, intrinsics=leaves["intrinsics"], cam_to_world=leaves["cam_to_world"]),
@@ -135,7 +135,6 @@ def relative_error(value: Tensor, exact: Tensor) -> float:
 
 
 def assert_as_without(result: Result, clean: Result, gone: int) -> None:
-    """Check that the others have the same bits as without Gaussian `gone`."""
     for name, output in clean.outputs.items():
         assert torch.equal(result.outputs[name], output), name
     dim = result.alpha.ndim - 3  # of the Gaussians, after those of the batch

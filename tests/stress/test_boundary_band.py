@@ -11,7 +11,6 @@ from benchmarks.stability.boundary_band import boundary_band
 
 # Outputs that have a gradient, and options of `render`.
 CASES = {
-    "random": (("image",), {"depth": False}),
     "random, depth": (("alpha", "depth"), {"depth": "expected"}),
     "pixel-aligned, antialiased": (("image",), {"depth": False, "antialiased": True}),
 }

@@ -1,52 +1,40 @@
 """Gradients against finite differences, and every backend against the reference, in every mode."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import pytest
 import torch
 from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_gradient
 
 from asysplat.rendering import INRIA, render
-from asysplat.scene import Cameras, Gaussians
-
-
-class Mode(NamedTuple):
-    options: dict  # of `render`
-    degree: int = 1  # of SH
-    scale: float = 5.0  # of the Gaussians, beside `make_scene`'s
-
+from asysplat.scene import Gaussians
 
 # So wide a dilation that small splats still reach every pixel; half of the opacity is left.
 FLOOR = replace(INRIA, eps2d=8.0, compensation_min=0.25)
-MODES = {
-    "expected": Mode({}),
-    "accumulated": Mode({"depth": "accumulated"}),
-    "median": Mode({"depth": "median"}),
-    "antialiased": Mode({"antialiased": True}),
-    "antialiased, below the floor": Mode({"antialiased": True, "limits": FLOOR}, scale=0.2),
-    "antialiased, above the floor": Mode({"antialiased": True, "limits": FLOOR}),
-    "degree 3": Mode({}, degree=3),
+MODES = {  # options of `render`; the degree of SH, and how wide the Gaussians are
+    "expected": ({}, 1, 5.0),
+    "accumulated": ({"depth": "accumulated"}, 1, 5.0),
+    "median": ({"depth": "median"}, 1, 5.0),
+    "antialiased": ({"antialiased": True}, 1, 5.0),
+    "antialiased, below the floor": ({"antialiased": True, "limits": FLOOR}, 1, 0.2),
+    "antialiased, above the floor": ({"antialiased": True, "limits": FLOOR}, 1, 5.0),
+    "degree 3": ({}, 3, 5.0),
 }
 
 
-def soft_scene(make_scene, mode: Mode, dtype=torch.float64) -> tuple[Gaussians, Cameras]:
-    """Wide Gaussians on few pixels: no alpha near a cut-off, no color near 0."""
-    gaussians, cameras = make_scene(3, 2, 5, 6, mode.degree)
-    gaussians = Gaussians(
-        gaussians.means * torch.tensor([0.2, 0.2, 1], dtype=torch.float64),
-        gaussians.quats,
-        gaussians.scales * mode.scale,
-        gaussians.opacities,
-        gaussians.sh * 0.3,
-    )
-    return gaussians.to(dtype), cameras.to(dtype)
+@pytest.fixture(params=MODES)
+def soft_scene(make_scene, request):
+    """Wide Gaussians on few pixels, no alpha near a cut-off, no color near 0; and options."""
+    options, degree, width = MODES[request.param]
+    gaussians, cameras = make_scene(3, 2, 5, 6, degree)
+    gaussians.means[:, :2] *= 0.2
+    gaussians.scales.mul_(width)
+    gaussians.sh.mul_(0.3)
+    return gaussians, cameras, options
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_every_gradient_equals_finite_differences(make_scene, mode):
-    mode = MODES[mode]
-    gaussians, cameras = soft_scene(make_scene, mode)
+def test_every_gradient_equals_finite_differences(soft_scene):
+    gaussians, cameras, options = soft_scene
     leaves = [getattr(gaussians, name) for name in FIELDS]
     leaves += [cameras.cam_to_world, cameras.intrinsics, BACKGROUND]
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
@@ -54,19 +42,18 @@ def test_every_gradient_equals_finite_differences(make_scene, mode):
     def outputs(*leaves):
         *fields, poses, intrinsics, background = leaves
         views = replace(cameras, cam_to_world=poses, intrinsics=intrinsics)
-        out = render(Gaussians(*fields), views, background, **mode.options)
+        out = render(Gaussians(*fields), views, background, **options)
         outputs = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
         return tuple((t * random_gradient(name, t)).sum((-1, -2)) for name, t in outputs.items())
 
     assert torch.autograd.gradcheck(outputs, leaves, atol=1e-7, fast_mode=True)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_every_gradient_equals_that_of_the_reference(fast_backend, make_scene, mode):
-    mode = MODES[mode]
-    gaussians, cameras = soft_scene(make_scene, mode, torch.float32)
-    result = both_ways(fast_backend, gaussians, cameras, **mode.options)
-    assert_close(fast_backend, result, both_ways(EXACT, gaussians, cameras, **mode.options))
+def test_every_gradient_equals_that_of_the_reference(fast_backend, soft_scene):
+    gaussians, cameras, options = soft_scene
+    scene = gaussians.to(torch.float32), cameras.to(torch.float32)
+    result, exact = (both_ways(backend, *scene, **options) for backend in (fast_backend, EXACT))
+    assert_close(fast_backend, result, exact)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.1], ids="{:g} pixels".format)

@@ -17,13 +17,11 @@ LARGE = "blobs or wide or mixed or huge_step"
 # The cases of each file here, as an expression of pytest's -k.
 STRESS = {
     "boundary_band": "depth",
-    "culled": "reason and True or length or nothing and median or poison and opacities",
-    "extents": "not alpha",
+    "culled": "nothing and median or poison and opacities",
+    "extremes": "not alpha and not gsplat",
     "gradchecks": "",
     "memory_and_types": "strided or bfloat16",
     "needles": "needles",
-    "opacities": "not gsplat",
-    "places": "",
     "properties": "cropping",
     "sizes": "odd and not 4096",
     "threads_and_order": "equal_depths",

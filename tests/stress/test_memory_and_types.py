@@ -71,19 +71,10 @@ def test_strided_and_expanded_inputs_and_gradients(backend, make_scene):
         "background": BACKGROUND,
     }
     leaves = {k: t.detach().to(backend.dtype).requires_grad_() for k, t in leaves.items()}
-    scene = Gaussians(
-        means=leaves["means"],
-        quats=leaves["quats"].flip(0),
-        scales=leaves["scales"].mT,
-        opacities=leaves["opacities"].expand(12),
-        sh=leaves["sh"].expand(12, -1, -1),
-    )
-    views = replace(
-        cameras,
-        cam_to_world=leaves["cam_to_world"],
-        intrinsics=leaves["intrinsics"].expand(3, 3, 3),
-    )
-    out = render(scene, views, leaves["background"].expand(3, 3), backend.name)
+    means, quats, scales, opacities, sh, poses, intrinsics, background = leaves.values()
+    scene = Gaussians(means, quats.flip(0), scales.mT, opacities.expand(12), sh.expand(12, -1, -1))
+    views = replace(cameras, cam_to_world=poses, intrinsics=intrinsics.expand(3, 3, 3))
+    out = render(scene, views, background.expand(3, 3), backend.name)
     torch.testing.assert_close(out.image, plain.image, rtol=0, atol=1e-6)
     # Strides of an image that lies [W, H, 3] in memory, and of numbers that are all the same.
     one = torch.ones((), dtype=backend.dtype)

@@ -1,10 +1,8 @@
-"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make slow.
+"""Long runs: make slow.
 
-As a program, refine a scene: every gradient is finite, and the result is drawn the same again.
-
-python tests/stress/test_soak.py path/to/scene 1000
-NUMBA_BOUNDSCHECK=1 python tests/stress/test_soak.py path/to/scene 1000, with memory poisoned too
-python tests/stress/test_soak.py render, the memory that a thousand calls leave behind
+python tests/stress/test_soak.py path/to/scene 1000 refines a scene: every gradient is finite, and
+the result is drawn the same again; with NUMBA_BOUNDSCHECK=1 in poisoned memory.
+python tests/stress/test_soak.py render measures the memory that a thousand calls leave behind.
 """
 
 import gc
@@ -31,7 +29,6 @@ SCENES = ("fern", "fox", "mydesk", "hololens-000")
 CHECKED = {"NUMBA_BOUNDSCHECK": "1", "GLIBC_TUNABLES": "glibc.malloc.perturb=128"}
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
-plain_and_checked = pytest.mark.parametrize("extra", [{}, CHECKED], ids=["plain", "checked"])
 
 
 def run(command: list[str], cwd: Path, extra: dict[str, str]) -> str:
@@ -43,19 +40,10 @@ def run(command: list[str], cwd: Path, extra: dict[str, str]) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-@plain_and_checked
+@pytest.mark.parametrize("extra", [{}, CHECKED], ids=["plain", "checked"])
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_thousand_steps_of_all_fields(shared, repository, scene, extra):
     print(run([__file__, str(shared / "data" / scene), "1000"], repository, extra))
-
-
-@plain_and_checked
-def test_training_for_three_hundred_steps(shared, repository, tmp_path, extra):
-    overrides = ["data=files", f"data.root={shared / 'data' / 'mydesk'}", "data.cache.folder=null"]
-    command = ["train.py", *overrides, "steps=300", "validate_every=100", f"paths.logs={tmp_path}"]
-    folder = run(command, repository, extra).removeprefix("run: ")
-    numbers = json.loads((Path(folder) / "metrics.json").read_text())
-    assert numbers["test/files/psnr"] > numbers["baseline/files/mean_color/psnr"] + 1
 
 
 @pytest.mark.parametrize("call", ["render", "refine", "load"])
@@ -86,7 +74,6 @@ def memory_growth(call: str) -> float:
 
 
 def refine_and_draw(views: Views, start: Gaussians, steps: int) -> Gaussians:
-    """Check that no gradient is NaN, and that the result is drawn the same twice."""
     non_finite = []
 
     def watch(_, refinement) -> bool:
@@ -112,8 +99,7 @@ elif __name__ == "__main__":
         start = initial_gaussians("plane_sweep", photographs.inputs, DEFAULT)
         end = refine_and_draw(views, start, steps)
         images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
-    flat = mean_color_images(views, views)
-    before, after, flat = (psnr(image, views.images).mean().item() for image in (*images, flat))
-    kind = " with checks, in poisoned memory" if checked else ""
-    print(f"{scene}: {steps} steps{kind}, {before:.2f} to {after:.2f} dB, flat {flat:.2f} dB")
+    images.append(mean_color_images(views, views))
+    before, after, flat = (psnr(image, views.images).mean().item() for image in images)
+    print(f"{scene}: {steps} steps, {before:.2f} to {after:.2f} dB, flat {flat:.2f} dB")
     assert after > before + 1 and after > flat + 1

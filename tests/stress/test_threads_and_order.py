@@ -5,40 +5,35 @@ import torch
 from backends import EXACT, FAST, FIELDS, INTERPRETED, assert_same_bits, both_ways, max_error
 from tangents import tangent_scene
 
-from asysplat.scene import Cameras, Gaussians
 from benchmarks.scenes import random_scene
 
 
 @pytest.mark.medium
 def test_any_number_of_threads_gives_the_same_bits(backend, threads):
     scenes = [random_scene(backend.many, 48, 64, seed) for seed in range(2)]
-    gaussians = Gaussians.stack([scene for scene, _ in scenes])
-    cameras = Cameras.stack([views for _, views in scenes])
+    gaussians, cameras = (type(parts[0]).stack(parts) for parts in zip(*scenes, strict=True))
     cameras = cameras.map(lambda t: t.repeat(1, 2, 1, 1))
     cameras.cam_to_world[:, 1, 0, 3] = 0.5
-
-    def run(count):
-        threads(count)
-        return both_ways(backend, gaussians, cameras)
-
-    one = run(1)
-    for count in (1, 2):
-        assert_same_bits(run(count), one, f"{count} threads: ")
+    assert_any_threads_agree(backend, (gaussians, cameras), threads)
 
 
 @pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="too many for the interpreter")
-def test_six_renderings_of_a_dense_scene_are_the_same(threads):
-    """Bits and statistics, on one thread and on two, where splats end at the edges of tiles."""
+def test_renderings_of_splats_that_end_at_the_edges_of_tiles_are_the_same(threads):
     cpu = next(backend for backend in FAST if backend.name == "cpu")
-    scene = tangent_scene(40_000, 256, 256)
-    found = []
-    for index in range(6):
-        threads(1 + index % 2)
-        found.append(both_ways(cpu, *scene))
-        assert_same_bits(found[-1], found[0])
-        assert found[-1].stats == found[0].stats
-    assert found[0].stats["pairs"] > 80_000
+    found = assert_any_threads_agree(cpu, tangent_scene(40_000, 256, 256), threads)
+    assert found.stats["pairs"] > 80_000
+
+
+def assert_any_threads_agree(backend, scene, threads):
+    threads(1)
+    one = both_ways(backend, *scene)
+    for count in (1, 2, 1, 2):
+        threads(count)
+        found = both_ways(backend, *scene)
+        assert_same_bits(found, one, f"{count} threads: ")
+        assert found.stats == one.stats
+    return one
 
 
 def test_equal_depths_are_drawn_by_index(backend, make_scene):
