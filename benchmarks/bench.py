@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from asysplat.ops.adam.cpu import adam_step_cpu
 from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.ops.image_loss import image_loss
-from asysplat.ops.ssd.chunked import CHUNK
+from asysplat.ops.ssd.reference import CHUNK
 from asysplat.refinement import Refinement
 from asysplat.scene import Views
 from benchmarks.compare import RATIO, TrackedMetrics

@@ -1,9 +1,9 @@
 """The operators in which training and reconstruction spend most of their time.
 
-Each operator is a folder. `reference.py` computes the formula in torch, in float64 too; cpu (Numba)
-and cuda (Triton) hold kernels, which are tested against it; `__init__.py` chooses one of them. The
-scans also have `chunked.py`, a fast implementation in torch. Their kernels are in `forward.py` and
-`backward.py`, one file per pass; `chunk.py` holds what the passes share, and `scan.py` runs both.
+An operator with kernels is a folder. `reference.py` computes the formula in torch, in float64 too;
+cpu (Numba) and cuda (Triton) hold kernels, which are tested against it; `__init__.py` chooses one
+of them. The scans' `reference.py` also has a fast implementation in torch. Their kernels are in
+`kernels.py`, and the `__init__.py` beside it runs both passes.
 """
 
 from asysplat.ops.grid_attention import grid_attention

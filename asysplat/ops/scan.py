@@ -129,10 +129,9 @@ class Scan:
 
 
 def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Register asysplat::<name> and its backward pass with torch; see `Scan` for the arguments.
+    """Register asysplat::<name> and its backward pass with torch, and return the former.
 
-    Returns:
-        (backend, x, dt, A, B, C, D, reverse, keep) -> (y, saved state).
+    It maps (backend, x, dt, A, B, C, D, reverse, keep) to (y, saved state).
     """
     tensors = "Tensor x, Tensor dt, Tensor A, Tensor B, Tensor C, Tensor D"
     kernels = partial(load_kernels, name)

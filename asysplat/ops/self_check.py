@@ -111,9 +111,8 @@ def _compare(
 ) -> dict[str, float]:
     """Compare the output and all gradients of an operator with those of its reference in float64.
 
-    Args:
-        sample: draws the inputs from a function that draws normal numbers.
-        backends: names of the backends of the kernels and of the reference.
+    `sample` draws the inputs from a function that draws normal numbers; `backends` names the
+    kernels and the reference.
     """
     results = []
     for backend, dtype in zip(backends, (torch.float32, torch.float64), strict=True):

@@ -47,7 +47,7 @@ def record_launches(capability: int) -> list[Launch]:
 
     No GPU is needed, and nothing is computed.
     """
-    hopper = "asysplat.ops.ssd.cuda.scan._compute_capability"
+    hopper = "asysplat.ops.ssd.cuda._compute_capability"
     with _recording() as (launches, fills), patch(hopper, lambda x: divmod(capability, 10)):
         for case, run in CASES.items():
             start = len(launches)

@@ -18,7 +18,7 @@ from asysplat.evaluation.static_cost import (
 from asysplat.models.attention import CrossAttention, SelfAttention
 from asysplat.models.mamba2 import Mamba2Direction
 from asysplat.models.mamba_vision import MambaVisionMixer
-from asysplat.ops.ssd.chunked import CHUNK
+from asysplat.ops.ssd.reference import CHUNK
 
 
 @pytest.mark.medium

@@ -58,7 +58,7 @@ def test_output_and_gradients_equal_the_reference(name, chunks, more, reverse):
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("length", [32, 77])
 def test_a_selective_scan_in_segments_equals_the_reference(monkeypatch, length, reverse):
-    scan = import_module("asysplat.ops.selective_scan.cuda.scan")
+    scan = import_module("asysplat.ops.selective_scan.cuda")
     monkeypatch.setattr(scan, "SEGMENT", 1)
     monkeypatch.setattr(scan, "SHORTEST", 16)
     check("selective_scan", arguments("selective_scan", length), reverse)
@@ -66,7 +66,7 @@ def test_a_selective_scan_in_segments_equals_the_reference(monkeypatch, length, 
 
 def test_a_selective_scan_takes_memory_in_proportion_to_its_inputs(monkeypatch):
     """On the meta device, where no kernel runs: allocations without contents."""
-    scan = import_module("asysplat.ops.selective_scan.cuda.scan")
+    scan = import_module("asysplat.ops.selective_scan.cuda")
     for name in ("sum_chunk", "pass_states", "forward_chunk", "backward_chunk"):
         monkeypatch.setattr(scan, name, defaultdict(lambda: lambda *_, **__: None))
     peaks = []

@@ -14,15 +14,8 @@ from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 def adam_step(tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings) -> int:
     """Update the visible rows in place, float32 by the kernels of its device, else by torch.
 
-    A row that is not visible, or has a non-finite gradient in any of the tensors, keeps its
-    parameters and averages in all of them.
-
-    Args:
-        tensors: tensors of N rows; row i of all of them is updated, or of none.
-        visible: rows to update.
-
-    Returns:
-        The number of visible rows with a non-finite gradient.
+    A row with a non-finite gradient in any of the tensors is updated in none of them; the number of
+    such visible rows is returned.
     """
     check = "asysplat.ops.self_check:adam"
     backends = {choose_fastest(rows.parameter, "reference", check) for rows in tensors}

@@ -33,38 +33,25 @@ BLOCK = 1024  # rows of a block
 
 
 class FlatRows(NamedTuple):
-    """`Rows` as NumPy arrays.
+    """`Rows` as NumPy arrays."""
 
-    Args:
-        parameter, gradient, mean, square: [N * K], see `Rows`.
-        steps: [N].
-        rates: [K, LANES] learning rates of the numbers of LANES rows.
-        rows: [K, LANES] row of each of these numbers, from 0 to LANES - 1.
-    """
-
-    parameter: np.ndarray
+    parameter: np.ndarray  # [N * K], like the next three
     gradient: np.ndarray
     mean: np.ndarray
     square: np.ndarray
-    steps: np.ndarray
-    rates: np.ndarray
-    rows: np.ndarray
+    steps: np.ndarray  # [N]
+    rates: np.ndarray  # [K, LANES] learning rates of the numbers of LANES rows
+    rows: np.ndarray  # [K, LANES] row of each of these numbers, from 0 to LANES - 1
 
 
 class Constants(NamedTuple):
-    """The numbers of an update that all rows share.
-
-    Args:
-        beta2, eps: see `AdamSettings`.
-        new1, new2: 1 - beta1 and 1 - beta2, the weights of the new gradient and its square.
-        corrections: [steps, 2], see `tabulate_corrections`.
-    """
+    """The numbers of an update that all rows share; see `AdamSettings`."""
 
     beta2: np.float32
-    new1: np.float32
-    new2: np.float32
+    new1: np.float32  # 1 - beta1, the weight of the new gradient
+    new2: np.float32  # 1 - beta2, the weight of its square
     eps: np.float32
-    corrections: np.ndarray
+    corrections: np.ndarray  # [steps, 2], see `tabulate_corrections`
 
 
 def adam_step_cpu(
@@ -103,15 +90,9 @@ def _constants(settings: AdamSettings) -> Constants:
 
 @kernel
 def update_blocks(start, stop, tensors, visible, constants):
-    """Update the rows of the blocks start to stop.
+    """Update the rows of the blocks start to stop; return the number of visible rows not updated.
 
-    Args:
-        tensors: tuple of `FlatRows`.
-        visible: [N].
-        constants: see `Constants`.
-
-    Returns:
-        The number of visible rows with a non-finite gradient.
+    `tensors` is a tuple of `FlatRows`.
     """
     alive = np.zeros(BLOCK, np.bool_)
     factors = np.zeros((1, BLOCK, 2), np.float32)

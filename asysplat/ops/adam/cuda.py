@@ -56,12 +56,8 @@ def _launch(rows: Rows) -> tuple[tuple[int], dict[str, int]]:
     num, numbers = rows.parameter.shape
     width = triton.next_power_of_2(numbers)
     count = max(1, TILE // width)
-    return (triton.cdiv(num, count),), {
-        "num": num,
-        "NUMBERS": numbers,
-        "WIDTH": width,
-        "ROWS": count,
-    }
+    sizes = {"num": num, "NUMBERS": numbers, "WIDTH": width, "ROWS": count}
+    return (triton.cdiv(num, count),), sizes
 
 
 @kernel
@@ -86,28 +82,19 @@ def update_rows(
     square,
     steps,
     rates,
-    corrections,
-    alive,
-    last_step,
+    corrections,  # see `tabulate_corrections`
+    alive,  # [num], 0 or 1
+    last_step,  # in `corrections`
     beta2,
-    new1,
-    new2,
+    new1,  # 1 - beta1
+    new2,  # 1 - beta2
     eps,
     num,
     NUMBERS: tl.constexpr,
     WIDTH: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """Update the rows in `alive` of one tensor.
-
-    Args:
-        parameter, gradient, mean, square, steps, rates: see `Rows`.
-        corrections: see `tabulate_corrections`.
-        alive: [num], 0 or 1.
-        last_step: last step in `corrections`.
-        beta2, eps: see `AdamSettings`.
-        new1, new2: 1 - beta1 and 1 - beta2.
-    """
+    """Update the rows in `alive` of one tensor; see `Rows` and `AdamSettings`."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     updated = tl.load(alive + row, mask=row < num, other=0) != 0
     step = tl.load(steps + row, mask=updated, other=0) + 1

@@ -15,35 +15,22 @@ ROUNDING = 2.0**-25  # number so small that 1 - ROUNDING is rounded to 1 in floa
 
 
 class Rows(NamedTuple):
-    """A tensor of N rows of K numbers, with its gradient and the state of Adam.
+    """A tensor of N rows of K numbers, with its gradient and the state of Adam."""
 
-    Args:
-        parameter: updated in place, like `mean`, `square` and `steps`.
-        gradient: gradient of the loss.
-        mean, square: decaying averages of the gradient and of its square.
-        steps: number of updates of each row so far.
-        rates: learning rate of each number of a row, >= 0.
-    """
-
-    parameter: Float[Tensor, "N K"]
+    parameter: Float[Tensor, "N K"]  # updated in place, like `mean`, `square` and `steps`
     gradient: Float[Tensor, "N K"]
-    mean: Float[Tensor, "N K"]
-    square: Float[Tensor, "N K"]
-    steps: Int32[Tensor, "N"]
-    rates: Float[Tensor, "K"]
+    mean: Float[Tensor, "N K"]  # decaying average of the gradient
+    square: Float[Tensor, "N K"]  # decaying average of its square
+    steps: Int32[Tensor, "N"]  # number of updates of each row so far
+    rates: Float[Tensor, "K"]  # learning rate of each number of a row, >= 0
 
 
 class AdamSettings(NamedTuple):
-    """The settings of Adam.
+    """The settings of Adam."""
 
-    Args:
-        beta1, beta2: decay of `mean` and `square` per step, in [0, 1).
-        eps: number > 0 that is added to the root of the corrected square.
-    """
-
-    beta1: float
-    beta2: float
-    eps: float
+    beta1: float  # decay of `mean` per step, in [0, 1)
+    beta2: float  # decay of `square` per step, in [0, 1)
+    eps: float  # number > 0 that is added to the root of the corrected square
 
 
 def adam_step_reference(

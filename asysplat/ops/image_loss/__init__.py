@@ -31,16 +31,13 @@ def image_loss(
     window, has the loss of w = 0.
 
     Args:
-        rendered: RGB; half precision is computed in fp32.
+        rendered: RGB; half precision is computed and returned in fp32.
         target: RGB in [0, 1], a constant for which no gradient is computed.
         ssim_weight: w in [0, 1]; at 0, SSIM is not computed.
         masks: False where a pixel is ignored: it takes the target's values, and so has no error and
             no gradient.
-        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" for float32
-            tensors on a CPU, else "reference".
-
-    Returns:
-        The loss of each image in fp32, or in float64 if `rendered` is float64.
+        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" on a CPU
+            unless `rendered` is float64, else "reference".
     """
     _check(rendered, target, ssim_weight, masks)
     on_cpu = rendered.device.type == "cpu" and rendered.dtype != torch.float64

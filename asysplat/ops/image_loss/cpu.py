@@ -117,11 +117,8 @@ class _ImageLoss(torch.autograd.Function):
 def compare_bands(start, stop, images, weights, sums, gradient):
     """Compare the bands start to stop, counted over [channels of all images, bands of a channel].
 
-    Args:
-        images, weights: see `ImagePair` and `Weights`.
-        sums: [bands, 2], written: the sum of |d| over a band's pixels, and that of 1 - SSIM over
-            the windows that begin in the band.
-        gradient: gradient of the loss, shaped as `images.rendered`, written; or None.
+    `sums` [bands, 2] receives the sum of |d| over a band's pixels, and that of 1 - SSIM over the
+    windows that begin in the band; `gradient`, unless None, that of the loss.
     """
     _, H, W = images.rendered.shape
     bands = -(-H // BAND)

@@ -21,34 +21,56 @@ MIN_BEND = 1e-9  # smallest curvature of a parabola whose minimum is computed
 TOLERANCE = 0.01  # relative difference up to which two inverse depths agree
 PIXELS_AT_ONCE = 2**20  # pixels whose consistency is checked at a time
 FRONT = 1e-6  # smallest depth in another view that is in front of it, over the depth in this view
+VECTOR = 16  # planes that the CPU kernel computes at once: its LANES, whose import needs Numba
 
 
 class BestPlane(NamedTuple):
-    """The plane of least cost at each pixel.
+    """The plane of least cost at each pixel."""
 
-    Args:
-        plane: index of the plane, with a fraction.
-        contrast: mean cost over all planes minus the least cost.
-    """
-
-    plane: Float[Tensor, "B V h w"]
-    contrast: Float[Tensor, "B V h w"]
+    plane: Float[Tensor, "B V h w"]  # index of the plane, with a fraction
+    contrast: Float[Tensor, "B V h w"]  # mean cost over all planes minus the least cost
 
 
 class Consistency(NamedTuple):
-    """The numbers of other views that confirm or contradict a depth, each weighted by its trust.
+    """The numbers of other views that confirm or contradict a depth, each weighted by its trust."""
 
-    Args:
-        agreeing: views with the same depth at the pixel's point.
-        contradicting: views that see through the point, to a surface behind it.
-        occluding: views that see a surface in front of the point.
-        containing: views whose image contains the point, visible or occluded, each counted as 1.
-    """
+    agreeing: Float[Tensor, "B V h w"]  # that have the same depth at the pixel's point
+    contradicting: Float[Tensor, "B V h w"]  # that see through the point, to a surface behind it
+    occluding: Float[Tensor, "B V h w"]  # that see a surface in front of the point
+    containing: Float[Tensor, "B V h w"]  # whose image contains the point, each counted as 1
 
-    agreeing: Float[Tensor, "B V h w"]
-    contradicting: Float[Tensor, "B V h w"]
-    occluding: Float[Tensor, "B V h w"]
-    containing: Float[Tensor, "B V h w"]
+
+class CostInputs(NamedTuple):
+    """The inputs of the cost volume's kernels for the n views of all scenes; or NumPy arrays."""
+
+    images: Tensor  # [n, H, W], each minus its mean
+    padded: Tensor  # [n, H + 1, W + 1], with the last row and column repeated
+    neighbors: Tensor  # [n, K] indices of neighboring views among all n; -1 for none
+    projections: Tensor  # [n, K, 3, 4]
+    inverse: Tensor  # [n, planes rounded up to whole vectors] inverse depths
+
+
+def prepare_inputs(
+    images: Float[Tensor, "B V H W"],
+    neighbors: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+    ranges: Float[Tensor, "B V 2"],
+    planes: int,
+) -> CostInputs:
+    """Convert the inputs of `cost_volume` to those of its kernels."""
+    device = images.device
+    # The mean's square would hide the small variances of an image.
+    flat = (images - images.mean((-1, -2), keepdim=True)).flatten(0, 1)
+    first = torch.arange(len(images), device=device)[:, None, None] * images.shape[1]
+    steps = (ranges[..., 1:] - ranges[..., :1]) / (planes - 1)
+    indices = torch.arange(-(-planes // VECTOR) * VECTOR, device=device)
+    return CostInputs(
+        images=flat.contiguous(),
+        padded=F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0].contiguous(),
+        neighbors=torch.where(neighbors >= 0, neighbors + first, -1).flatten(0, 1).contiguous(),
+        projections=projections.flatten(0, 1).contiguous(),
+        inverse=(ranges[..., :1] + indices * steps).flatten(0, 1),
+    )
 
 
 def cost_volume(
@@ -68,8 +90,7 @@ def cost_volume(
     Args:
         images: gray images.
         neighbors: indices of neighboring views in the same scene; -1 for none.
-        projections: matrices into the neighbors; see `matrices` in
-            asysplat/models/prior/projections.py.
+        projections: see `matrices` in asysplat/models/prior/projections.py.
         ranges: inverse depths of the first and of the last plane.
         planes: number of planes, at least 2, at equal steps of inverse depth.
     """
@@ -142,12 +163,9 @@ def sgm(
 ) -> BestPlane:
     """Aggregate the costs along rows and columns, both ways, and find the plane of least cost.
 
-    A change of plane between adjacent pixels costs less where the color changes.
-
-    Args:
-        costs: matching costs of D planes.
-        weights: weights of the pixels' costs, in [0, 1].
-        edges: color differences to the pixel on the left, and to the pixel above.
+    A change of plane between adjacent pixels costs less where the color changes: `edges` has the
+    color differences to the pixel on the left, and to the pixel above. The `weights` of the pixels'
+    costs are in [0, 1].
     """
     costs = costs * weights[..., None].clamp_min(MIN_WEIGHT)
     penalty = LARGE_STEP / (1 + edges / EDGE)
@@ -205,13 +223,10 @@ def consistency(
     A view that sees a surface in front of the point neither confirms nor contradicts it.
 
     Args:
-        inverse: inverse depths.
         steps: smallest difference of inverse depths that each view can distinguish.
         trust: weight of each depth, in [0, 1].
-        others: indices of the views to compare with, in the same scene; -1 for none.
-        projections: matrices into these views; see `matrices` in
-            asysplat/models/prior/projections.py.
-        tolerance: relative difference up to which two inverse depths agree. They also agree up to
+        others, projections: see `neighbors` and `projections` of `cost_volume`.
+        tolerance: relative difference up to which two inverse depths agree; they also agree up to
             half a step.
     """
     B, _, h, w = inverse.shape

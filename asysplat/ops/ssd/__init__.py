@@ -4,8 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.scan import Scan, ScanInputs
-from asysplat.ops.ssd.chunked import CHUNK, ssd_chunked
-from asysplat.ops.ssd.reference import ssd_reference
+from asysplat.ops.ssd.reference import CHUNK, ssd_chunked, ssd_reference
 
 
 def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:

@@ -26,20 +26,12 @@ HALF, FRONT = np.float32(0.5), np.float32(reference.FRONT)
 
 
 class ConsistencyInputs(NamedTuple):
-    """NumPy arrays for the n views of all scenes; see `reference.consistency`.
+    """The inputs of `reference.consistency` for the n views of all scenes."""
 
-    Args:
-        maps: [n, h, w, 2], inverse depths and the trust in them.
-        steps: [n].
-        others: [n, K].
-        projections: [n, K, 3, 4].
-        tolerance: relative difference up to which two inverse depths agree.
-    """
-
-    maps: np.ndarray
-    steps: np.ndarray
-    others: np.ndarray
-    projections: np.ndarray
+    maps: np.ndarray  # [n, h, w, 2], inverse depths and the trust in them
+    steps: np.ndarray  # [n]
+    others: np.ndarray  # [n, K]
+    projections: np.ndarray  # [n, K, 3, 4]
     tolerance: np.float32
 
 
@@ -70,13 +62,7 @@ def consistency(
 
 @kernel
 def count_views(start, stop, inputs, views, counts):
-    """Write the counts of the views start to stop.
-
-    Args:
-        inputs: see `ConsistencyInputs`.
-        views: number of views of a scene.
-        counts: see `reference.Consistency`, each [n, h, w].
-    """
+    """Write the counts, each [n, h, w], of the views start to stop; a scene has `views` views."""
     h, w = inputs.maps.shape[1:3]
     bottom, right = np.float32(h), np.float32(w)
     columns = np.arange(w).astype(np.float32) + HALF

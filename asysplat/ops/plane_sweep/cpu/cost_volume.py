@@ -28,8 +28,7 @@ from asysplat.kernels.simd.vectors import (
     zeros,
 )
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.inputs import CostInputs, prepare_inputs
-from asysplat.ops.plane_sweep.reference import BEST, WINDOW
+from asysplat.ops.plane_sweep.reference import BEST, WINDOW, CostInputs, prepare_inputs
 
 assert BEST == 2 and WINDOW == 5  # the kernel keeps two costs, and sums five columns
 RADIUS = WINDOW // 2
@@ -64,12 +63,7 @@ def cost_volume(
 
 @kernel
 def cost_planes(start, stop, inputs, costs):
-    """Write the costs of the blocks start to stop, counted over [views, vectors of planes].
-
-    Args:
-        inputs: see `CostInputs`.
-        costs: [n, H, W, D], written.
-    """
+    """Write the costs [n, H, W, D] of the blocks start to stop of [views, vectors of planes]."""
     H, W = inputs.images.shape[1:]
     planes = costs.shape[-1]
     K = inputs.neighbors.shape[1]

@@ -45,14 +45,10 @@ def sgm(
 
 @kernel
 def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
-    """Write the planes and contrasts of the views start to stop.
+    """Write the planes and contrasts, [n, h, w], of the views start to stop.
 
-    Args:
-        costs: [n, h, w, D].
-        weights: [n, h, w] weights of the pixels' costs.
-        penalties: [n, 2, h, w] penalties for a step of several planes, from the pixel on the left
-            and from the pixel above.
-        plane, contrast: [n, h, w], written; see `reference.BestPlane`.
+    `penalties` [n, 2, h, w] are for a step of several planes, from the pixel on the left and from
+    the pixel above.
     """
     h, w, planes = costs.shape[1:]
     vectors = -(-planes // LANES)
@@ -101,11 +97,8 @@ def _begin(weighted, sums, costs, weight):
 def _extend(old, new, low, far, cost, sums):
     """Extend the paths by a pixel: write their costs, add them to `sums`, and return the least.
 
-    Args:
-        old, new: costs of the paths before and after, with one more element at each end.
-        low: least cost in `old`.
-        far: sum of `low` and the penalty for a step of several planes.
-        cost: costs of the pixel.
+    The costs before and after, `old` and `new`, have one more element at each end. `low` is the
+    least of `old`, and `far` exceeds it by the penalty for a step of several planes.
     """
     lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):

@@ -52,19 +52,13 @@ def count_views(
     occluding,
     containing,
     tolerance,
-    views,
-    neighbors,
+    views,  # number of views of a scene
+    neighbors,  # number of views in `others` for each view
     height,
     width,
     PIXELS: tl.constexpr,
 ):
-    """Write the counts of PIXELS pixels of a view; see `reference.Consistency`.
-
-    Args:
-        inverse, steps, trust, others, projections, tolerance: see `reference.consistency`.
-        views: number of views of a scene.
-        neighbors: number of views in `others` for each view.
-    """
+    """Write the counts of PIXELS pixels of a view; see `reference.consistency`."""
     view = tl.program_id(1).to(tl.int64)
     first = view // views * views
     place = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.inputs import prepare_inputs
+from asysplat.ops.plane_sweep.reference import prepare_inputs
 
 RADIUS = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
@@ -64,8 +64,8 @@ def cost_band(
     neighbors,
     projections,
     inverse,
-    means,
-    scales,
+    means,  # [n, H, W], of the patches
+    scales,  # [n, H, W], 1 / the patches' standard deviations
     costs,
     height,
     width,
@@ -76,12 +76,7 @@ def cost_band(
     PLANES: tl.constexpr,
     BAND: tl.constexpr,
 ):
-    """Write the costs [n, H, W, D] of COLUMNS x PLANES in BAND rows.
-
-    Args:
-        images, padded, neighbors, projections, inverse: see `CostInputs`.
-        means, scales: [n, H, W] means of the patches, and 1 / their standard deviations.
-    """
+    """Write the costs [n, H, W, D] of COLUMNS x PLANES in BAND rows; see `CostInputs`."""
     view = tl.program_id(2).to(tl.int64)
     parts = tl.cdiv(planes, PLANES)
     column = tl.program_id(0) // parts * COLUMNS + tl.arange(0, COLUMNS)
@@ -164,7 +159,7 @@ def add_row(line, neighbor_image, matrix, x, row, depth, height, width):
 def factors_at(matrix, y):
     """Return the factors of x, 1 and the inverse depth in a neighbor's homogeneous coordinates.
 
-    They are three numbers for each of the three coordinates, for the pixels of row y.
+    They are three for each coordinate, for the pixels of row y.
     """
     y += 0.5
     factors = ()

@@ -52,26 +52,18 @@ def sgm(
 def add_paths(
     costs,
     weights,
-    penalties,
+    penalties,  # [n, h, w], for a step of several planes, from the pixel on the left or above
     total,
     lines,
     length,
-    apart,
-    step,
+    apart,  # stride from one line to the next
+    step,  # stride from one pixel of a line to the next
     planes,
     REVERSE: tl.constexpr,
     LINES: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """Add to `total` the costs of the paths along LINES lines, in one direction.
-
-    Args:
-        costs, total: [n, h, w, D].
-        weights: [n, h, w] weights of the pixels' costs.
-        penalties: [n, h, w] penalties for a step of several planes, from the pixel on the left or
-            above.
-        apart, step: strides from one line to the next, and from one pixel of a line to the next.
-    """
+    """Add to `total` [n, h, w, D] the costs of the paths along LINES lines, in one direction."""
     view = tl.program_id(1).to(tl.int64)
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     plane = tl.broadcast_to(tl.arange(0, PLANES)[None, :], (LINES, PLANES))
