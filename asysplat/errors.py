@@ -41,7 +41,6 @@ def first_mistake(error: Any, title: str | None = None) -> InputError:
     """Return the first mistake that a ValidationError of pydantic lists, as a sentence.
 
     Args:
-        error: the ValidationError.
         title: the name of the option that was checked; None: that of a dataclass of options.
     """
     first = error.errors()[0]

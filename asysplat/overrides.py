@@ -26,7 +26,6 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> DictConf
     Args:
         overrides: `key=value`, in Hydra's syntax; Hydra's own options are not checked. Of a sweep
             each value is composed once, with some values of the others.
-        script: name of the configuration file in conf/.
     """
     parsed = [_parse(word) for word in overrides if not word.lstrip("+~").startswith("hydra")]
     lines = [values for values in map(_values, parsed) if values]

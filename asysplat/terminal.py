@@ -34,12 +34,7 @@ def print_table(
     is longer than a line.
 
     Args:
-        console: the terminal.
         headings: titles of the columns.
-        rows: one text for each column.
-        title: stands above the first table.
-        box: the borders.
-        first: the columns that a table may begin with, by number; empty: all.
     """
 
     def part(numbers: Sequence[int]) -> Table:

@@ -55,11 +55,7 @@ class Augmentation:
     def expose(
         self, inputs: Views, targets: Views, rng: np.random.Generator
     ) -> tuple[Views, Views]:
-        """Vary the exposure of a task's views, and add noise to its inputs.
-
-        Args:
-            inputs, targets: [V, ...].
-        """
+        """Vary the exposure of a task's views, and add noise to its inputs."""
         red, blue = rng.uniform(-self.white_balance, self.white_balance, 2)
         stops = rng.uniform(-self.exposure, self.exposure) + np.array([red, 0.0, blue])
         flicker = rng.uniform(-self.flicker, self.flicker, (inputs.cameras.num_views, 1))
@@ -88,7 +84,6 @@ def center_crop(views: Views, fraction: float) -> Views:
     accordingly; the poses stay.
 
     Args:
-        views: [V, ...].
         fraction: fraction of each side to keep, in (0, 1].
     """
     height, width = views.cameras.height, views.cameras.width

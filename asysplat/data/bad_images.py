@@ -48,12 +48,7 @@ class BadImages:
         return results
 
     def report(self, scene: str, usable: int) -> None:
-        """Report the collected errors, after all images of a scene were read.
-
-        Args:
-            scene: name of the scene, for the message.
-            usable: number of its images that can be used.
-        """
+        """Report the collected errors, after all images of a scene were read."""
         bad, total = len(self.errors), usable + len(self.errors)
         different = list(dict.fromkeys(self.errors))
         listed = "".join(f"\n  {error}" for error in different[:MAX_LISTED])

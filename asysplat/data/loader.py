@@ -12,13 +12,7 @@ from asysplat.errors import InputError
 
 @dataclass(frozen=True)
 class BatchSplit:
-    """A global batch of `processes` x `micro_batch` x `accumulated` scenes.
-
-    Args:
-        processes: number of processes that train together, on all nodes.
-        micro_batch: scenes that a process holds at a time.
-        accumulated: micro-batches whose gradients make an optimizer step.
-    """
+    """A global batch of `processes` x `micro_batch` x `accumulated` scenes."""
 
     processes: int
     micro_batch: int
@@ -35,10 +29,8 @@ def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> Bat
     """Divide a global batch evenly.
 
     Args:
-        batch_size: scenes of an optimizer step.
         micro_batch: the most scenes that a process may hold at a time; fewer where these do not
             divide its scenes; None: all of its scenes.
-        processes: number of processes that train together.
     """
     scenes, remainder = divmod(batch_size, processes)
     if remainder:

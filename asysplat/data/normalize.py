@@ -93,7 +93,6 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
 
     Args:
         points: in the world of the cameras.
-        cameras: one scene's cameras, [V].
     """
     exact_points, exact = torch.as_tensor(points, dtype=torch.float64), cameras.to(torch.float64)
     inverse = torch.zeros(cameras.num_views, cameras.height, cameras.width)

@@ -66,8 +66,6 @@ class SceneOptions:
     """How scenes on disk are opened.
 
     Args:
-        height, width: size of every view, in pixels.
-        layout: a name in `readers.LAYOUTS`, or auto.
         on_error: "fail" raises one error that names every image that cannot be used; "skip"
             leaves those images out with a warning, and decodes each image once to find them.
         cache: keeps decoded pixels; None keeps none.
@@ -108,7 +106,6 @@ class PosedScene:
     """The content of a scene's files, as a reader returns it.
 
     Args:
-        name: unique within the data set.
         images: in the order they were taken.
         read_points: reads sparse points of the scene's surfaces; None where the files have none.
         origin: origin of the poses and points, in the coordinates of the files; see `near_origin`.

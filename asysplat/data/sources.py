@@ -29,15 +29,11 @@ MAX_OPEN = 64  # scenes of a folder
 
 @dataclass(frozen=True)
 class Task:
-    """A sequence, with the indices of the input images and of the images to predict.
-
-    Args:
-        prune: whether a model that prunes its Gaussians does so.
-    """
+    """A sequence, with the indices of the input images and of the images to predict."""
 
     sequence: ImageSequence
     selection: Selection
-    prune: bool = True
+    prune: bool = True  # in a model that prunes its Gaussians
 
 
 @runtime_checkable
@@ -63,13 +59,10 @@ class ProceduralSource:
     Splits share no seeds.
 
     Args:
-        height, width: size of every view, in pixels.
-        num_images: length of each camera path.
         window: least and greatest number of consecutive images that a training task is drawn from;
             None: all images.
         first_window: window of the first task; None: `window`.
         val_scenes, test_scenes: number of scenes of each split.
-        places: content of the scenes: both, rooms or outdoors.
         varied: whether training scenes are varied; see ProceduralScene.
     """
 
@@ -151,7 +144,6 @@ class FilesSource:
             first_96 (its ablations), uniform, or index.
         index: with selection=index, the file that names the images; scenes that it does not name
             are not tested, and validation takes every_8th.
-        val_scenes: greatest number of scenes that validate.
         targets_may_be_inputs: whether a training task's targets may be among its inputs.
     """
 
@@ -281,11 +273,6 @@ def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -
 
     A set without a root of its own is always tested. One with a root is tested only by data on
     disk, if the root is given and the set has another name than the data.
-
-    Args:
-        test_sets: name -> the options in which it differs from the data set.
-        name: name of the data set.
-        on_disk: whether the data set is read from disk.
     """
     return {
         test_set: options

@@ -113,11 +113,8 @@ class VGGFeatures(nn.Module):
     """Computes frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
 
     Args:
-        name: network, one of the VGGs.
-        weights: from `find_backbone(name, ...)`.
         taps: indices of the layers of torchvision's `features` whose outputs are returned.
         std: RGB; divides the images after ImageNet's mean color is subtracted.
-        mean_pooling: pool by the mean instead of the maximum.
     """
 
     def __init__(

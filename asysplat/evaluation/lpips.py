@@ -22,9 +22,7 @@ def load_lpips(
     The linear heads come with the lpips package.
 
     Args:
-        net: the backbone, AlexNet or VGG16.
         backbone_dir: folder that may hold the backbone's weights, see `find_backbone`.
-        download: whether to download missing weights.
     """
     import lpips  # not above: it imports torchvision, which takes as long as torch
 

@@ -52,9 +52,6 @@ class CostMeter:
     """Measures seconds and peak memory from each `start` to its `stop`.
 
     All meters share the process's peak, so their intervals must not overlap.
-
-    Args:
-        device: device of the work.
     """
 
     def __init__(self, device: torch.device):

@@ -56,7 +56,6 @@ class PostOptimization:
 
     Args:
         steps: after which to measure, increasing; 0: as predicted.
-        protocol: how views are measured.
         lpips: as for `Protocol.image_metrics`.
         background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
         backgrounds: scene's name -> background of this scene, where another one is known.
@@ -87,7 +86,6 @@ class PostOptimization:
         """Measure one scene; the costs do not include the metrics.
 
         Args:
-            scene: name of the scene.
             predict: the input views -> [N] Gaussians, or another scene, in their frame.
             inputs, targets: the scene's views, without a batch dimension.
             watch: called after each step with the number of steps and, at the steps to measure, the

@@ -107,8 +107,6 @@ class Protocol:
 
         Args:
             rendered, depths: renderings of the targets; without depths only images are measured.
-            targets: [V] views.
-            lpips: network, see `image_metrics`.
             psnr_only: compute no other metric.
         """
         rows = []

@@ -46,8 +46,6 @@ def measure_scenes(
             `inputs` and `targets`.
         predictor: returns the `predict` of a scene, whose costs are measured; see
             `PostOptimization`.
-        measure: measures a scene.
-        device: device that computes.
         folder: folder for figures/evaluation-post<steps>.png, which show the first scene at the
             first and the last of the steps.
         scene_folder: folder of the results of single scenes, which are read and written there.

@@ -30,10 +30,8 @@ def free_radii(
     A wall is the first that a look outward meets with half of the opacity, in any pixel.
 
     Args:
-        gaussians: scene.
         outward: cam_to_world of each frame's look, from a point in free space.
         starts: radii of these points, `radius` at most.
-        radius: radius of the path without walls.
     """
     # Here, as it would slow down import asysplat.
     from scipy.ndimage import minimum_filter1d, uniform_filter1d

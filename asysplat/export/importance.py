@@ -19,7 +19,6 @@ def blending_weights(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "N
     An image is linear in the Gaussians' colors, with these weights as its gradient.
 
     Args:
-        gaussians: [N].
         cameras: [V]; views are rendered one by one.
     """
     gray = torch.zeros_like(gaussians.sh[:, :1], requires_grad=True)

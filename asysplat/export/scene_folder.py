@@ -102,7 +102,6 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
     Args:
         scenes: a folder with a file for each scene, named as the scene; or the file of the only
             scene, under any name.
-        sequences: the data's scenes.
     """
     option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds = f"{', '.join(READERS)}"
@@ -146,7 +145,6 @@ def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitte
 
     Args:
         gaussians, cameras: in one frame.
-        file: the Gaussians' file, for the message.
         fitted: whether they were moved there by the file's cameras.
     """
     with torch.no_grad():

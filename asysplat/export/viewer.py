@@ -303,10 +303,7 @@ def draw_layer(
     """Render one layer of a scene, as colors.
 
     Args:
-        gaussians: [N]; those with an opacity below `min_opacity` are left out.
-        camera: one view.
         layer: "color", "alpha", or "depth": disparities, the nearest bright.
-        sh_degree: maximum degree of SH.
         size: factor of the scales, > 0.
         antialiased: see `render`.
     """

@@ -55,9 +55,6 @@ def fit_similarity(
     """Fit the rigid motion, and the scale applied after it, that take points to their targets.
 
     Least squares in float64 (Umeyama 1991, Eq. 40 to 43); points on a line leave the rotation open.
-
-    Args:
-        source, target: not all in one place.
     """
     source, target = source.double(), target.double()
     centered, centered_target = source - source.mean(0), target - target.mean(0)

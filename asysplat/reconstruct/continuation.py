@@ -21,7 +21,6 @@ def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     stranger.
 
     Args:
-        config: configuration of reconstruct.py; it is left as it is.
         options: names of the options on the command line, which stay.
     """
     if config.run is None:

@@ -40,8 +40,6 @@ class Results:
     """Write the result folder of a reconstruction, with the configuration conf/reconstruct.yaml.
 
     Args:
-        folder: a new folder is created there.
-        config: the configuration.
         per_view: the Gaussians depend on the view, so that no scene file holds them.
     """
 

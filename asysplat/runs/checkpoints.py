@@ -154,8 +154,6 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
 
     Args:
         path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
-        module: module to load into.
-        option: option that named the path, for messages.
     """
     if path is None:
         return

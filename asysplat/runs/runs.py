@@ -88,11 +88,6 @@ def hashed_options(
     Left out are NOT_HASHED, the number of loader processes, and further test sets. Of the test
     root, disparities and a checkpoint to start from, only whether they are given is returned.
     Missing values (`???`) are allowed.
-
-    Args:
-        config: a run's configuration.
-        earlier: configurations of its stages before the last, whose hashes are returned; None:
-            those of `stage_configs`.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
@@ -208,7 +203,6 @@ def folder_of(
     """Return the folder of a finished run.
 
     Args:
-        run: value of the option run=: the folder, or "last".
         logs: folder in which "last" is searched.
         find: function that returns the folders of the finished runs below a folder, oldest first.
         files: names of files that the folder must have.

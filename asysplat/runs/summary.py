@@ -71,9 +71,7 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
     """Print the test and its baselines, the costs, the figures and, last, the run's folder.
 
     Args:
-        results: a run's results; what was not measured is left out.
         data: the test set to print in full, each stage in a row; of others only PSNR is printed.
-        folder: the run's folder.
     """
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]

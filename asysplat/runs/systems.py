@@ -21,8 +21,6 @@ def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any])
     """Describe a system, and what it is measured on, for evaluation.json.
 
     Args:
-        config: configuration of train.py.
-        system: its name.
         made_of: what its scenes depend on, such as `contents_below` their files.
     """
     tested = options_of_test(config, config.data.name)

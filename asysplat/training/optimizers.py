@@ -75,8 +75,6 @@ class Muon(Optimizer):
     matrices of one shape are multiplied together, in float32 on a CPU: 3.5 times as fast.
 
     Args:
-        params: matrices [m, n].
-        lr: learning rate.
         rms: root mean square of a step at learning rate 1; 0.2 is about that of AdamW's in a long
             training (Liu et al. 2025, "Muon is scalable", Eq. 4).
         momentum: decay of the mean of gradients; Nesterov's.

@@ -47,7 +47,6 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
     """Name a job of a sweep by its options that vary, for `hydra.sweep.subdir` of conf/train.yaml.
 
     Args:
-        overrides: the job's options.
         params: `hydra.sweeper.params`. Options swept on the command line are read from sys.argv,
             which a scheduler's processes lack; then every option is in the name.
     """

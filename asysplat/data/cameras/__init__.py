@@ -31,7 +31,6 @@ class CameraOptions:
             lowers the reprojection error by a hundredth, else given.
         where: folder of found and refined cameras.
         frames: greatest number of frames of a video.
-        console: console that shows the progress; None shows none.
     """
 
     choice: str = "given"

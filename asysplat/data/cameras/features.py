@@ -55,8 +55,6 @@ def match_photographs(
             features are not wanted.
         lenses: lens by the name of each photograph, in the order of the sequence; photographs of
             the same lens have one camera.
-        effort: effort for features and matches.
-        progress: bars, to which two are added.
         cameras: camera of each lens, where lenses are known; else a focal length is guessed.
     """
     database = work / f"{effort.features}.db"

@@ -42,7 +42,6 @@ class Attempt:
     """How hard cameras are sought.
 
     Args:
-        effort: effort for features and matches.
         first_pair, image: least number of inliers of the pair to start with, and of an image that
             is added.
         angle: least angle between the rays of the pair to start with, in degrees.
@@ -75,10 +74,6 @@ def find_cameras(
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
             given cameras are ignored; or a video.
-        where: parent of the folder, whose name follows from the photographs.
-        frames: greatest number of frames of a video, each the sharpest of an equal part.
-        on_error: "fail", or "skip" to leave out photographs that cannot be read.
-        console: console that shows the progress; None shows none.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:

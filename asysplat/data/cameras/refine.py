@@ -66,8 +66,6 @@ def refine_cameras(
 
     Args:
         scene: scene whose images are files, each once.
-        where: parent of the folder, whose name follows from photographs and cameras.
-        console: console that shows the progress; None shows none.
     """
     where = Path(where).absolute()
     images = {image.file: image for image in scene.images if isinstance(image.file, Path)}

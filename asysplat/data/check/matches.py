@@ -60,9 +60,6 @@ def find_matches(sequence: ImageSequence, console: Console | None = None) -> Mat
     The gap between the images of a pair doubles while enough points match, and halves while too few
     match. Pairs without parallax do not constrain the camera's position: they are dropped if they
     are the minority.
-
-    Args:
-        console: where to show a progress bar; None shows none.
     """
     keypoints = cache(partial(_detect, sequence))
 

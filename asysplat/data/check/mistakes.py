@@ -34,8 +34,6 @@ class Mistake:
     """One way in which cameras may be wrong.
 
     Args:
-        name: the mistake, as a sentence without its period.
-        fix: what to do about it.
         correct: computes the correct cameras from the cameras as read.
     """
 

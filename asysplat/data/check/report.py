@@ -140,7 +140,6 @@ class Report:
     Args:
         sequence: the usable images, at the size at which they were matched.
         rows: the name and text of each printed measurement.
-        matches: the points that the cameras are compared with.
     """
 
     sequence: FileSequence
@@ -153,9 +152,7 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     """Decode every image, match some of them, and diagnose the cameras.
 
     Args:
-        scene: returned by a reader.
         bad: the damaged images that the reader found; those found here are added.
-        console: where to show progress bars; None shows none.
     """
     if not scene.images:
         bad.report(scene.name, 0)

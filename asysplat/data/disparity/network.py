@@ -50,12 +50,7 @@ def network_size(height: int, width: int, patch: int) -> tuple[int, int]:
 
 
 def load_depth_anything(model: str, download: bool) -> DepthAnything:
-    """Load a network of relative depth with transformers.
-
-    Args:
-        model: a folder, or a name on the Hugging Face Hub.
-        download: whether to download missing weights.
-    """
+    """Load a network of relative depth with transformers."""
     try:
         # Extra that is missing where types are checked.
         from transformers import AutoModelForDepthEstimation  # ty: ignore[import-not-found]

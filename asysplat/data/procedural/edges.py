@@ -48,7 +48,6 @@ def average_samples(
 
     Args:
         colors, surfaces: at every pixel's center.
-        pixels: flat indices.
         sampled: surface hit by each ray of `sample_directions`.
     """
     height, width = surfaces.shape

@@ -34,7 +34,6 @@ class FloorPlan:
         irradiance: irradiance of a surface that faces the light from close by, linear RGB [3].
         falloff: distance at which the light is half as strong.
         ambient: light from all directions, linear RGB [3].
-        occupied: (spot, radius) of objects on the ground.
     """
 
     walk: Float[np.ndarray, "T 2"]

@@ -46,9 +46,6 @@ class ProceduralScene:
 
     Args:
         seed: any integer >= 0; see `split_seed`.
-        height, width: size of the images in pixels.
-        num_images: along the path.
-        device: computes the images.
         places: rooms or outdoors; with both, the seed decides.
         varied: adds thin and small near objects, gloss, antialiased edges, more kinds of camera
             paths, and focal lengths from wide to long.

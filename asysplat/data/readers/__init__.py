@@ -103,11 +103,7 @@ def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
-    """Open one scene without reading pixels.
-
-    Args:
-        scene: folder of the scene, or a path that `find_scenes` returned.
-    """
+    """Open one scene without reading pixels."""
     path, layout = Path(scene).absolute(), options.layout
     _check_layout(layout)
     if layout == "auto":

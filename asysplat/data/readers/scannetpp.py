@@ -73,9 +73,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     Includes the benchmark's test images where they were published. Images that the file marks
     `is_bad` are left out, with a warning.
-
-    Args:
-        scene: a file of poses, or a folder that stands for one.
     """
     files = find_scenes(scene)
     if len(files) != 1:

@@ -60,8 +60,6 @@ def read_images(
 
     Args:
         content: the file's, with a list "frames".
-        file: where it was read, for messages.
-        bad: collects the errors of images that cannot be used.
         folder: what its paths are relative to; None: the file's own folder.
         resized: whether images may have another size than w x h, to which the intrinsics belong.
     """

@@ -44,8 +44,6 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
     Gaussians are ordered along a Z-order curve, so that those of a range are near each other.
 
     Args:
-        path: the file.
-        gaussians: [N].
         antialiased: as for `render`: a comment tells it.
     """
     scene = in_morton_order(prepare_for_export(gaussians))

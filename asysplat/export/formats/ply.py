@@ -45,8 +45,6 @@ def write_ply(
     renderer needs to know: `antialiased 0` or `1`, and `sh_degree`.
 
     Args:
-        path: the file.
-        gaussians: [N].
         offset: to be added to the means, which float32 may not resolve: written as a comment,
             `comment offset X Y Z`, if it is not 0.
         background: RGB in [0, 1] behind the Gaussians, if known: written as a comment likewise.

@@ -53,8 +53,6 @@ def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
     Z-order curve.
 
     Args:
-        path: the file.
-        gaussians: [N].
         antialiased: as for `render`: meta.json tells it.
     """
     content = encode_sog(gaussians, antialiased)

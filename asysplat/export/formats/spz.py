@@ -71,7 +71,6 @@ def write_spz(
     Gaussians are ordered along a Z-order curve.
 
     Args:
-        path: the file.
         gaussians: [N].
         version: 2 or 3, gzip, which most programs read; 4, Zstandard, needs the package zstandard.
         antialiased: as for `render`: a flag tells it.

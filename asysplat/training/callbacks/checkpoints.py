@@ -63,7 +63,6 @@ class Checkpoints(ModelCheckpoint):
         dirpath: the folder.
         minutes: minutes of training after which last.ckpt is written between validations; 0: after
             every step; None: only after validations.
-        options: Lightning's.
     """
 
     def __init__(self, dirpath: str | Path, minutes: int | float | None = None, **options: Any):
@@ -174,9 +173,6 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
     """Change the state of a training loop so that it resumes with the next untrained batch.
 
     Lightning would end a completed epoch again, or count a batch that was only fetched.
-
-    Args:
-        loop: the state of the loop of epochs, changed in place.
     """
     epoch, batch = loop["epoch_progress"], loop["epoch_loop.batch_progress"]
     if epoch["current"]["ready"] == epoch["current"]["processed"]:  # between two epochs

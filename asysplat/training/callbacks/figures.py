@@ -16,7 +16,6 @@ class Figures(Callback):
     """Draws a `comparison_figure` of the first scenes of each validation and first test set.
 
     Args:
-        folder: the run's folder; the PNG files are written to its sub-folder `figures`.
         scenes: how many scenes to draw.
     """
 
@@ -65,11 +64,7 @@ class Figures(Callback):
 
 
 class Curve(Callback):
-    """Writes a row for each validation; draws them after training.
-
-    Args:
-        folder: the run's folder.
-    """
+    """Writes a row for each validation; draws them after training."""
 
     def __init__(self, folder: str):
         self.folder = Path(folder)

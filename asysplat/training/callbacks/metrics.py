@@ -23,10 +23,7 @@ class Metrics(Callback):
     the network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
 
     Args:
-        protocol: how views are measured.
-        folder: the run's folder; metrics.csv is written there after the test.
         backbone_dir: folder of LPIPS' backbone; without the backbone there is no LPIPS.
-        download: whether to download a missing backbone.
     """
 
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):

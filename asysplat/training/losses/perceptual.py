@@ -51,10 +51,6 @@ def vgg16(backbone_dir: str | None = None, download: bool = False) -> Perceptual
     """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
 
     Images are normalized with ImageNet's mean and standard deviation.
-
-    Args:
-        backbone_dir: folder that may hold the network's weights.
-        download: whether to download missing weights.
     """
     backbone = _backbone("vgg16", backbone_dir, download)
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
