@@ -43,10 +43,7 @@ LARGER_STACKS = {(90, "ssd.head_gradients"): 384, (90, "ssd.pass_states"): 272}
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(
-    "capability",
-    [80, 90, 100],
-)
+@pytest.mark.parametrize("capability", [80, 90, 100])
 def test_every_launch_compiles_and_fits(capability):
     launches = without_repeats(record_launches(capability), capability)
     names = {f"{package}.{name}" for package, names in KERNELS.items() for name in names}

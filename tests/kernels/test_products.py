@@ -40,13 +40,9 @@ def test_product_adds_to_a_multiple_of_the_output(rows, terms, columns):
     expected = 0.5 * out.astype(float) + a.astype(float) @ b
     product(out, a, b, np.float32(0.5))
     assert_close(out, expected)
-
-
-def test_a_factor_of_zero_overwrites_nan_and_factors_may_be_transposed():
-    a, b = draw(70, 2 * ROWS + 1), draw(70, LANES)
-    out = np.full((a.shape[1], LANES), np.nan, np.float32)
-    product(out, a.T, b, np.float32(0))
-    assert_close(out, a.T.astype(float) @ b)
+    out = np.full((rows, columns), np.nan, np.float32)
+    product(out, draw(terms, rows).T, b, np.float32(0))  # overwrites NaN; factors may be transposed
+    assert_close(out, draw(terms, rows).T.astype(float) @ b)
 
 
 @pytest.mark.parametrize("upper", [False, True])

@@ -1,14 +1,10 @@
 """The CPU backend on other machines, and in forked processes."""
 
-import multiprocessing
 import os
 import subprocess
 import sys
 
 import pytest
-import torch
-
-from asysplat.rendering import render
 
 PLAIN = """
 import torch
@@ -24,6 +20,30 @@ assert (out.image - exact.image).abs().max() < 1e-6
 grads = [torch.autograd.grad(x.image.square().sum(), leaves.means)[0] for x in (out, exact)]
 assert (grads[0] - grads[1]).norm() < 5e-6 * grads[1].norm()
 assert "zmm" not in next(iter(rasterize.inspect_asm().values()))
+"""
+FORKED = """
+import multiprocessing, torch
+from asysplat import load, render
+from asysplat.data import ProceduralScene
+torch.set_num_threads(2)
+views, network = ProceduralScene(1, 64, 64, 8).views(range(4)), load(None)
+
+with torch.no_grad():
+    expected = network(views)  # on two threads
+    image = render(expected, views.cameras).image
+context = multiprocessing.get_context("fork")
+queue = context.SimpleQueue()
+def child():
+    same = torch.equal(render(expected, views.cameras).image, image)
+    gaussians = network(views)
+    gaussians.means.sum().backward()
+    queue.put((same, (gaussians.means.detach() - expected.means).abs().max().item()))
+process = context.Process(target=child, daemon=True)
+process.start()
+process.join(60)
+assert process.exitcode == 0, process.exitcode
+same, error = queue.get()
+assert same and error < 1e-4, (same, error)
 """
 
 
@@ -42,49 +62,9 @@ def test_without_avx512_it_is_as_exact(tmp_path):
     assert done.returncode == 0, done.stderr.decode()
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_process_draws_too(make_scene):
-    """It does not inherit the threads of its parent."""
-    gaussians, cameras = make_scene(dtype=torch.float32, views=4)
-    expected = render(gaussians, cameras).image  # the pool of threads is there now
-
-    def draw(queue):
-        queue.put(torch.equal(render(gaussians, cameras).image, expected))
-
-    context = multiprocessing.get_context("fork")
-    queue = context.SimpleQueue()
-    process = context.Process(target=draw, args=(queue,))
-    process.start()
-    process.join(60)
-    assert process.exitcode == 0 and queue.get()
-
-
-FORKED = """
-import multiprocessing, torch
-from asysplat import load
-from asysplat.data import ProceduralScene
-torch.set_num_threads(2)
-views, network = ProceduralScene(1, 64, 64, 8).views(range(4)), load(None)
-
-with torch.no_grad():
-    expected = network(views).means  # on two threads
-context = multiprocessing.get_context("fork")
-queue = context.SimpleQueue()
-def child():
-    gaussians = network(views)
-    gaussians.means.sum().backward()
-    queue.put((gaussians.means.detach() - expected).abs().max().item())
-process = context.Process(target=child, daemon=True)
-process.start()
-process.join(60)
-assert process.exitcode == 0, process.exitcode
-assert queue.get() < 1e-4
-"""
-
-
 @pytest.mark.medium
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_process_predicts_and_trains_too():
-    """Although torch's OpenMP threads stay behind, for which a child would wait forever."""
+def test_a_forked_process_draws_predicts_and_trains_too():
+    """Although the threads of its parent stay behind, for which it would wait forever."""
     done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, timeout=200)
     assert done.returncode == 0, done.stderr.decode()

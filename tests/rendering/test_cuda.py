@@ -24,10 +24,7 @@ def weighted_sum(image):
 
 
 def run(draw, gaussians, cameras, settings, masks=None):
-    """Return images, gradients of every input, and statistics.
-
-    Where there are `masks`, [1, 1, H, W], images are 0 where a pixel does not count.
-    """
+    """Images, 0 where a pixel does not count, gradients of every input, and statistics."""
     leaves = [getattr(gaussians, name) for name in FIELDS]
     leaves += [cameras.cam_to_world, cameras.intrinsics]
     leaves = [t.detach().requires_grad_() for t in leaves]
@@ -95,7 +92,7 @@ EXTREMES = {  # norm of the quaternions, smallest and largest scale
 }
 
 
-def extreme_errors(make_scene, name, extremes, device):
+def check_extremes(make_scene, extremes, backend, device, image_error, grad_error):
     norm, smallest, largest = EXTREMES[extremes]
     gaussians, cameras = make_batch(make_scene, count=40, height=33, width=40, device=device)
     powers = torch.rand(gaussians.scales.shape, generator=torch.manual_seed(0)).to(device)
@@ -104,23 +101,20 @@ def extreme_errors(make_scene, name, extremes, device):
     settings, scene = RenderSettings(depth=None), (gaussians, cameras)
     exact = run(reference.draw, *(part.to(torch.float64) for part in scene), settings)
     assert exact[0][1].max() > 0.3
-    images, grads = errors(run(BACKENDS[name], *scene, settings), exact)
-    return max(images), max(grads)
+    images, grads = errors(run(BACKENDS[backend], *scene, settings), exact)
+    assert max(images) <= image_error and max(grads) <= grad_error
 
 
 @pytest.mark.parametrize("extremes", EXTREMES)
 def test_extreme_numbers_are_as_exact_in_float32(make_scene, extremes):
-    image, grad = extreme_errors(make_scene, "cpu", extremes, "cpu")
-    assert image <= 1e-6 and grad <= 1e-5
-    image, grad = extreme_errors(make_scene, "reference", extremes, "cpu")
-    assert image <= 1e-5 and grad <= 1e-4
+    check_extremes(make_scene, extremes, "cpu", "cpu", 1e-6, 1e-5)
+    check_extremes(make_scene, extremes, "reference", "cpu", 1e-5, 1e-4)
 
 
 @kernel
 @pytest.mark.parametrize("extremes", [*EXTREMES][:-1])  # its gradients are float32
 def test_extreme_numbers_are_as_exact_on_a_gpu(make_scene, extremes):
-    image, grad = extreme_errors(make_scene, "cuda", extremes, DEVICE)
-    assert image <= 1e-6 and grad <= 1e-5
+    check_extremes(make_scene, extremes, "cuda", DEVICE, 1e-6, 1e-5)
 
 
 # The statistic that counts each kind of culling.
@@ -206,17 +200,9 @@ def test_a_large_scene_is_the_same_every_time_and_that_of_the_cpu(make_scene):
         assert (got.cpu() - grad).norm() < 1e-2 * grad.norm()
 
 
-def needles(scene):
-    """Thin and long, the centers of most far outside the image."""
-    gaussians, cameras = scene
-    gaussians.scales.mul_(torch.tensor([100, 0.05, 0.05]))
-    gaussians.means[..., :2].mul_(20)
-    return gaussians, cameras
-
-
 @kernel
-@pytest.mark.parametrize("change", [lambda scene: scene, needles], ids=["blobs", "needles"])
-def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch, change):
+@pytest.mark.parametrize("shape", ["blobs", "needles"])
+def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch, shape):
     from asysplat.rendering.cuda import draw as module
 
     found = []
@@ -227,7 +213,10 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
 
     list_tiles = module._list_tiles
     monkeypatch.setattr(module, "_list_tiles", keep)
-    scene = change(make_batch(make_scene, views=2, count=60, height=45, width=50))
+    scene = make_batch(make_scene, views=2, count=60, height=45, width=50)
+    if shape == "needles":  # thin and long, the centers of most far outside the image
+        scene[0].scales.mul_(torch.tensor([100, 0.05, 0.05]))
+        scene[0].means[..., :2].mul_(20)
     stats = draw_by_cuda(*(part.to(DEVICE) for part in scene), RenderSettings()).stats
     ((depths, (lists, _)),) = found
     splats = lists.splats
@@ -266,19 +255,17 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
 
 
 @kernel
-def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
-    monkeypatch.setattr("asysplat.rendering.interface.MAX_PAIRS", 3)
-    with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
-        draw_by_cuda(*make_batch(make_scene, device=DEVICE), RenderSettings())
-
-
-@kernel
 @pytest.mark.parametrize(
-    "limit, found", [("MAX_IMAGES", "2 views"), ("MAX_SPLATS", "12 Gaussians")]
+    "limit, value, found",
+    [
+        ("MAX_PAIRS", 3, r"\d+ pairs.* 3: "),
+        ("MAX_IMAGES", 1, r"2 views.* 1[ :].*"),
+        ("MAX_SPLATS", 1, r"12 Gaussians.* 1[ :].*"),
+    ],
 )
-def test_too_many_splats_are_an_error(make_scene, monkeypatch, limit, found):
-    monkeypatch.setattr(f"asysplat.rendering.interface.{limit}", 1)
-    with pytest.raises(InputError, match=rf"{found}.* 1[ :].*set views_at_once"):
+def test_too_many_pairs_or_splats_are_an_error(make_scene, monkeypatch, limit, value, found):
+    monkeypatch.setattr(f"asysplat.rendering.interface.{limit}", value)
+    with pytest.raises(InputError, match=f"{found}set views_at_once"):
         draw_by_cuda(*make_batch(make_scene, views=2, device=DEVICE), RenderSettings())
 
 

@@ -13,7 +13,7 @@ from backends import INTERPRETED
 
 # Small cases of each kernel: the renderer's, those of both scans and those of the plane sweep.
 KERNELS = ("rendering/test_cuda.py", "ops/test_cuda_scans.py", "ops/test_plane_sweep.py")
-LARGE = "blobs or wide or mixed or huge_step"
+LARGE = "blobs or wide or mixed"
 # The cases of each file here, as an expression of pytest's -k.
 STRESS = {
     "boundary_band": "depth",
