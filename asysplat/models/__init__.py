@@ -12,12 +12,11 @@ from asysplat.models.links import (
     FusedTokens,
     NoLink,
 )
-from asysplat.models.mamba2 import BiMamba2
-from asysplat.models.mamba_vision import MambaVision
+from asysplat.models.mamba import BiMamba2, MambaVision
 from asysplat.models.mvsplat import MVSplat
+from asysplat.models.network import EarlyExit, Prune
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, PointsPrior
 from asysplat.models.single_branch import SingleBranch, build_single_branch
-from asysplat.models.skips import EarlyExit, Prune
 
 __all__ = [
     "AsySplat",

@@ -33,8 +33,7 @@ class AsySplat(TokenNetwork):
     Every component is a callable that builds a module, so that a configuration can replace it.
 
     Args:
-        widths: both branches' widths.
-        stage_ratios: r_s of each network stage.
+        stage_ratios: r_s, the MLP ratio of each network stage.
         layers: the layer mix of every stage, such as "4m4s": counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape.
         appearance_block: component built from the appearance branch's StageShape.
@@ -43,7 +42,7 @@ class AsySplat(TokenNetwork):
         fusion: component that makes the tokens that Gaussians are predicted from.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
-        prior: see TokenNetwork.
+        widths, prior: see TokenNetwork.
     """
 
     def __init__(
@@ -144,18 +143,11 @@ def build_asysplat(
     parameter_budget: float = 1.0,
     **components,
 ) -> AsySplat:
-    """Build an AsySplat of the given widths times `width`.
+    """Build an AsySplat of the given widths (d_s, d_f and the head_dim) times `width`.
 
-    With a `geometry_ratio`, choose the widths that give the geometry branch that fraction of the
-    parameters, at the same total.
-
-    Args:
-        stage_widths, fine_width, head_dim: d_s, d_f and the head_dim at width 1.
-        appearance_layers: N_v.
-        width: factor of the widths.
-        geometry_ratio: between 0 and 1, or None for the given widths.
-        parameter_budget: with a ratio, total parameters over those of the given widths.
-        components: the other arguments of AsySplat.
+    With a `geometry_ratio` in (0, 1), choose the widths that give the geometry branch that fraction
+    of the parameters. Their total is `parameter_budget` times that of the given widths.
+    `components` are the other arguments of AsySplat.
     """
     if geometry_ratio is None and parameter_budget != 1:
         raise InputError(

@@ -61,11 +61,7 @@ class SelfAttention(nn.Module):
 
 
 class FullAttention(SelfAttention):
-    """The letter t: every token attends to all tokens of all views.
-
-    Args:
-        qk_norm: whether to apply RMSNorm to queries and keys.
-    """
+    """The letter t: every token attends to all tokens of all views."""
 
     def __init__(self, shape: StageShape, qk_norm: bool = True):
         super().__init__(shape, grid=1, qk_norm=qk_norm)
@@ -74,9 +70,7 @@ class FullAttention(SelfAttention):
 class SparseAttention(nn.Module):
     """The letter s: convolutions within a view, then attention within a grid place (Sec. 3.3).
 
-    Args:
-        grid: p_g.
-        conv_blocks: whether to add the two conv blocks, which connect the grid places of a view.
+    `grid` is p_g; only the convolutions connect the grid places of a view.
     """
 
     def __init__(self, shape: StageShape, grid: int = 2, conv_blocks: bool = True):
@@ -113,10 +107,7 @@ class ConvBlocks(nn.Module):
 class CrossAttention(nn.Module):
     """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each view.
 
-    Args:
-        shape: shape of the attending tokens.
-        context_width: width of the attended tokens.
-        inner_width: width of queries, keys and values.
+    Queries, keys and values are `inner_width` wide.
     """
 
     def __init__(self, shape: StageShape, context_width: int, inner_width: int):

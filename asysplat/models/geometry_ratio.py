@@ -28,8 +28,7 @@ def solve_widths(
 
     Args:
         build: widths, appearance layers -> model with a `geometry_ratio()`.
-        base: the widths that define the total, together with `layers`.
-        layers: N_v, the layers of an appearance stage.
+        base, layers: widths and appearance layers that define the total.
         ratio: parameters of the geometry branch over all.
         budget: total parameters over those of `base` and `layers`.
     """

@@ -27,17 +27,12 @@ MAX_SIZE_CORRECTION = 1.0  # greatest correction of a size, in logarithms
 
 
 class Decoded(NamedTuple):
-    """What the decoder gives for each Gaussian; quats, scales and sh are any numbers.
+    """What the decoder gives for each Gaussian; quats, scales and sh are any numbers."""
 
-    Args:
-        depth_fraction: in [0, 1], place in the head's range of distances.
-        opacities: in [0, 1].
-    """
-
-    depth_fraction: Float[Tensor, "B V h w 1"]
+    depth_fraction: Float[Tensor, "B V h w 1"]  # in [0, 1], place in the head's range of distances
     quats: Float[Tensor, "B V h w 4"]
     scales: Float[Tensor, "B V h w 3"]
-    opacities: Float[Tensor, "B V h w"]
+    opacities: Float[Tensor, "B V h w"]  # in [0, 1]
     sh: Float[Tensor, "B V h w K 3"]
 
 
@@ -47,8 +42,7 @@ class GaussianHead(nn.Module, ABC):
     Each pixel of the image downsampled by p_c / p_f gets one, on the ray through its center.
 
     Args:
-        width: d_3.
-        patch_coarse, patch_fine: p_c, p_f.
+        width, patch_coarse, patch_fine: d_3, p_c, p_f.
         sh_degree: 0 to 3; None for a head that predicts no colors.
         opacity_bias: logit of an untrained opacity without a prior.
         std: standard deviation of the untrained weights.
@@ -130,7 +124,6 @@ class ResidualHead(GaussianHead):
     the appearance branch contributes less than in a head without it.
 
     Args:
-        width, patch_coarse, patch_fine, opacity_bias: see GaussianHead.
         sh_degree: 0 to 3; None: the colors are those of the image.
         near, far: distances along the ray lie between them, in units of the normalized scene.
         scale_bias: log of an untrained size, in pixel footprints.
@@ -148,8 +141,7 @@ class ResidualHead(GaussianHead):
         scale_bias: float = -0.5,
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=1e-3)
-        self.near, self.far = near, far
-        self.scale_bias = scale_bias
+        self.near, self.far, self.scale_bias = near, far, scale_bias
 
     def depth_fraction(
         self, distance: Float[Tensor, "B V h w"], views: Views
@@ -186,10 +178,8 @@ class LongLRMHead(GaussianHead):
     does, and a far one at 1e6, beyond every prediction.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree, opacity_bias: see GaussianHead.
         farthest: greatest distance, in that unit.
-        scale_bias: log of an untrained size.
-        largest: log of the largest size.
+        scale_bias, largest: logs of an untrained and of the largest size.
     """
 
     def __init__(
@@ -204,8 +194,7 @@ class LongLRMHead(GaussianHead):
         largest: float = -1.2,
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=0.02)
-        self.farthest = farthest
-        self.scale_bias, self.largest = scale_bias, largest
+        self.farthest, self.scale_bias, self.largest = farthest, scale_bias, largest
 
     def depth_fraction(
         self, distance: Float[Tensor, "B V h w"], views: Views

@@ -18,32 +18,20 @@ from asysplat.scene import Views
 
 @dataclass(frozen=True)
 class StageShape:
-    """The sizes of every block of a network stage.
+    """The sizes of every block of a network stage."""
 
-    Args:
-        width: d_s, or d_f in the appearance branch.
-        head_dim: channels of one attention or Mamba2 head; divides every width.
-        mlp_ratio: r_s, hidden over outer width of the stage's MLPs.
-    """
-
-    width: int
-    head_dim: int
-    mlp_ratio: int
+    width: int  # d_s, or d_f in the appearance branch
+    head_dim: int  # channels of one attention or Mamba2 head; divides every width
+    mlp_ratio: int  # r_s, hidden over outer width of the stage's MLPs
 
 
 @dataclass(frozen=True)
 class Widths:
-    """Every width of a model.
+    """Every width of a model."""
 
-    Args:
-        stages: (d_1, d_2, d_3) of the geometry branch.
-        fine: d_f of the appearance branch.
-        head_dim: channels of one attention or Mamba2 head; divides all others.
-    """
-
-    stages: tuple[int, ...]
-    fine: int
-    head_dim: int
+    stages: tuple[int, ...]  # (d_1, d_2, d_3) of the geometry branch
+    fine: int  # d_f of the appearance branch
+    head_dim: int  # channels of one attention or Mamba2 head; divides all others
 
     def scaled(self, factor: float) -> "Widths":
         """Multiply the widths by `factor`; keep the number of heads, of at least 4 channels."""
@@ -54,12 +42,7 @@ class Widths:
     def stage_shapes(
         self, stage_ratios: Sequence[int], **per_stage: Sequence[object]
     ) -> list[StageShape]:
-        """Return the shape of each stage.
-
-        Args:
-            stage_ratios: MLP ratio of each stage.
-            per_stage: other options with one entry for each stage.
-        """
+        """Return the shape of each stage; check that the options in `per_stage` are as many."""
         for name, values in {"stage_ratios": stage_ratios, **per_stage}.items():
             if len(values) != len(self.stages):
                 raise InputError(
@@ -76,9 +59,6 @@ class RMSNorm(nn.RMSNorm):
     """RMSNorm computed in the type of its weights, fp32, and returned in the input's.
 
     If weights and inputs differ in type, torch does not use its fused kernel.
-
-    Args:
-        width: size of the last dimension.
     """
 
     def __init__(self, width: int):
@@ -103,14 +83,7 @@ def pixel_features(views: Views, prior: Prior | None) -> Float[Tensor, "B V H W 
 
 
 class Tokenizer(nn.Module):
-    """Linear embedding of p x p patches, then LayerNorm.
-
-    Args:
-        patch: p_c or p_f, in pixels.
-        width: d_c or d_f.
-        channels: channels of a pixel, PIXEL_CHANNELS plus those of the prior.
-        bias: whether the LayerNorm has one.
-    """
+    """Linear embedding of p x p patches of pixels, then LayerNorm, with or without a bias."""
 
     def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS, bias: bool = True):
         super().__init__()

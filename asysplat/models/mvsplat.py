@@ -30,11 +30,9 @@ class MVSplat(Network):
     Args:
         width: factor of all channels.
         geometry_ratio, parameter_budget: must be None and 1: there is one branch.
-        channels: number of channels of the features.
-        refine_channels: number of channels of the U-Net over pixels.
+        channels, refine_channels: channels of the features, and of the U-Net over pixels.
         planes: number of inverse depths of the volume, equally spaced.
         near, far: least and greatest depth, in units of the normalized scene.
-        sh_degree: 0 to 3.
     """
 
     view_counts = (2, 8)
@@ -91,9 +89,8 @@ class MVSplat(Network):
         costs = cost_volume(features, cameras.resized(*features.shape[-2:]), self.inverse)
         volume = flat(torch.cat((costs, features), dim=2))
         refined = flat(self.volume_net(maps(self.volume_in(volume))))
-        likelihood = self.planes_head(self.volume_out(refined) + self.volume_skip(volume)).softmax(
-            1
-        )
+        likelihood = self.volume_out(refined) + self.volume_skip(volume)
+        likelihood = self.planes_head(likelihood).softmax(1)
         inverse = upsample(torch.einsum("ndhw,d->nhw", likelihood, self.inverse)[:, None])
         confidence = F.interpolate(likelihood.amax(1, keepdim=True), scale_factor=STRIDE)
         colors = flat(torch.cat((features, local), dim=2))
@@ -176,8 +173,7 @@ class ResidualBlock(nn.Module):
 class CrossViewLayer(nn.Module):
     """Attention within each window of a view, then to the same window of all other views.
 
-    Args:
-        shifted: move the windows by half their size (Swin).
+    Where `shifted`, windows are moved by half their size (Swin).
     """
 
     def __init__(self, width: int, shifted: bool):
@@ -293,9 +289,7 @@ def cost_volume(
 class UNet(nn.Module):
     """A U-Net of equal width at each level, whose coarsest level attends to all views.
 
-    Args:
-        width: number of features.
-        levels: each has half the resolution of the one before.
+    Each level has half the resolution of the one before.
     """
 
     def __init__(self, width: int, levels: int):
@@ -398,18 +392,13 @@ def quaternions(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c = (rotations[..., i, j] - rotations[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
     d, e, f = (rotations[..., i, j] + rotations[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
     # Each row is a multiple of the quaternion; the longest is the most precise.
-    rows = torch.stack(
-        [
-            torch.stack(row, dim=-1)
-            for row in (
-                (1 + x + y + z, a, b, c),
-                (a, 1 + x - y - z, d, e),
-                (b, d, 1 - x + y - z, f),
-                (c, e, f, 1 - x - y + z),
-            )
-        ],
-        dim=-2,
+    rows = (
+        (1 + x + y + z, a, b, c),
+        (a, 1 + x - y - z, d, e),
+        (b, d, 1 - x + y - z, f),
+        (c, e, f, 1 - x - y + z),
     )
+    rows = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
     longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
     return rows.take_along_dim(longest, dim=-2)[..., 0, :]
 

@@ -1,12 +1,15 @@
-"""The base of every network from views to Gaussians."""
+"""The base of every network from views to Gaussians, and what it need not compute."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
@@ -15,8 +18,52 @@ from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import PIXEL_CHANNELS, Layers, Widths, pixel_features
 from asysplat.models.prior import PRIOR_CHANNELS, Prior
-from asysplat.models.skips import EXACT, EarlyExit, Prune
+from asysplat.ranges import Fraction, PositiveFraction, configured
 from asysplat.scene import Gaussians, Views
+
+
+@dataclass(frozen=True, config=configured("speed"))
+class EarlyExit:
+    """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing.
+
+    From the first on, the network's `skippable_layers` are skipped; from the second on, the whole
+    network: the Gaussians are the prior's own.
+    """
+
+    skip_layers_above: PositiveFraction | None = None
+    skip_network_above: PositiveFraction | None = None
+
+
+EXACT = EarlyExit()
+
+
+@dataclass(frozen=True, config=configured("model.prune"))
+class Prune:
+    """Keep the most opaque Gaussians and a few of the rest, so that these learn too.
+
+    The public settings are 0.6 and 0.1 (arthurhero/Long-LRM,
+    configs/dl3dv_i540_32input_8target.yaml), the paper's Table 4 keeps half. There the rest is
+    drawn at random; here it is evenly spaced by opacity, so that the same views give the same
+    Gaussians.
+    """
+
+    prune_ratio: Annotated[float, Field(ge=0, lt=1)]  # fraction of the Gaussians to drop
+    random_ratio: Fraction = 0.0  # fraction of the kept ones that is not chosen by opacity
+
+    def __call__(self, gaussians: Gaussians) -> Gaussians:
+        """Select among Gaussians [B, N], the same number in each scene."""
+        count = gaussians.num_gaussians
+        kept = max(1, int(count * (1 - self.prune_ratio)))
+        if kept == count:
+            return gaussians
+        spaced = int(kept * self.random_ratio)
+        opaque = kept - spaced
+        order = gaussians.opacities.argsort(dim=-1, descending=True, stable=True)
+        steps = torch.arange(spaced, device=order.device)
+        ranks = opaque + steps * (count - opaque) // max(1, spaced)
+        chosen = torch.cat((order[:, :opaque], order[:, ranks]), -1)
+        rows = torch.arange(len(chosen), device=chosen.device)[:, None]
+        return gaussians.map(lambda field: field[rows, chosen])
 
 
 class Network(nn.Module, ABC):
@@ -128,7 +175,6 @@ class TokenNetwork(Network):
     1) and of its layers.
 
     Args:
-        widths: widths of the stages.
         patch, prior, prune: see Network.
     """
 
@@ -185,12 +231,7 @@ class TokenNetwork(Network):
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
-        """Compute the tokens that the head decodes.
-
-        Args:
-            pixels: see `pixel_features`.
-            skip_layers: layers to skip.
-        """
+        """Compute the tokens that the head decodes from `pixel_features`, without `skip_layers`."""
 
     def describe(self) -> str:
         """Return the number of parameters and the widths, in a line."""

@@ -10,8 +10,7 @@ from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Tokenizer, Widths
-from asysplat.models.network import TokenNetwork
-from asysplat.models.skips import Prune
+from asysplat.models.network import Prune, TokenNetwork
 from asysplat.models.stage import Component, Stage, build_component
 
 
@@ -19,15 +18,11 @@ class SingleBranch(TokenNetwork):
     """Tokens of one patch size through all stages; every pixel gives a Gaussian.
 
     Args:
-        widths: the network stages' widths; `widths.fine` is not used.
-        stage_ratios: MLP ratio of each stage.
-        stage_layers: layer mix of each stage, counts and letters of `blocks`.
+        widths, prior, prune: see TokenNetwork; `widths.fine` is not used.
+        stage_ratios, stage_layers, blocks, head: see AsySplat; each stage has a layer mix.
         merges: whether 2 x 2 tokens become one, before each stage.
-        blocks: letter -> component built from a StageShape.
-        head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come first in the sequence and have no place.
-        prior, prune: see TokenNetwork.
     """
 
     def __init__(
@@ -86,13 +81,9 @@ def build_single_branch(
     parameter_budget: float = 1.0,
     **components,
 ) -> SingleBranch:
-    """Build a SingleBranch whose widths are multiplied by `width`.
+    """Build a SingleBranch of the given widths times `width`; `components`: its other arguments.
 
-    Args:
-        stage_widths, head_dim: at width 1.
-        width: multiplies the widths.
-        geometry_ratio, parameter_budget: must be None and 1: there is one branch.
-        components: the other arguments of SingleBranch.
+    There is one branch: `geometry_ratio` and `parameter_budget` must be None and 1.
     """
     refuse_ratio(geometry_ratio, parameter_budget)
     widths = Widths(tuple(stage_widths), head_dim, head_dim).scaled(width)

@@ -35,8 +35,6 @@ class Stage(nn.Module):
     The layers see global tokens and the others as one sequence.
 
     Args:
-        previous_width: width of the incoming tokens.
-        shape: shape of this stage.
         layers: the layer mix, counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape, as in conf/model/blocks.yaml.
         merge: whether 2 x 2 tokens become one.
@@ -95,12 +93,7 @@ class TokenMerge(nn.Module):
 
 
 def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
-    """Return one letter for each layer: "4m4s" (or "4m+4s") gives m m m m s s s s.
-
-    Args:
-        mix: counts and letters.
-        letters: letters that name a block.
-    """
+    """Return one letter for each layer: "4m4s" (or "4m+4s") gives m m m m s s s s."""
     terms = re.findall(r"(\d{1,3})([a-z])", mix)
     total = sum(int(count) for count, _ in terms)
     known = letters.issuperset(letter for _, letter in terms)

@@ -16,14 +16,9 @@ class SelectiveAdam:
     Each row of each tensor counts its own steps for the bias correction, so that a row that is
     seldom visible, or a tensor whose learning rate was 0, starts as on the first step.
 
-    Args:
-        parameters: tensors by name, without gradients, contiguous, all with N rows, one for each
-            Gaussian. A step changes them in place; `keep` and `append` replace them.
-        betas: decay of the running averages of a gradient and of its square, in [0, 1).
-        eps: > 0, added to the root of the latter.
-
-    Attributes:
-        non_finite: number of visible rows not updated so far, for a NaN or infinite gradient.
+    Its `parameters`, by name, are contiguous, with a row for each of N Gaussians. A step changes
+    them in place; `keep` and `append` replace them. For betas and eps, see `AdamSettings`.
+    `non_finite` counts the visible rows not updated so far, for a NaN or infinite gradient.
     """
 
     def __init__(
@@ -57,12 +52,9 @@ class SelectiveAdam:
     ) -> None:
         """Update the visible rows, except those with a non-finite gradient.
 
-        Args:
-            gradients: by name.
-            rates: learning rates >= 0, by name; a tensor without one, or with 0, is not updated and
-                needs no gradient. A tensor that broadcasts to a row gives the rates of its
-                elements: [K, 1] for the K coefficients of `sh`.
-            visible: the rows to update.
+        A tensor without a learning rate, or with 0, is not updated and needs no gradient. A rate
+        that broadcasts to a row gives the rates of its elements: [K, 1] for the K coefficients of
+        `sh`.
         """
         _expect("visible", visible, (self.num_rows,))
         row_rates = {}

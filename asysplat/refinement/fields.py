@@ -19,13 +19,8 @@ Parameters = dict[str, Tensor]
 class Fields:
     """Offsets of the means, quaternions, log scales, opacity logits and SH, with their optimizer.
 
-    Each Gaussian has its own unit of the offsets, so that one learning rate suits near and far
-    ones.
-
-    Args:
-        gaussians: [N], initial values.
-        units: length of an offset of 1.
-        sh_degree: missing SH coefficients start at 0; None keeps the degree.
+    Each Gaussian has its own unit, the length of an offset of 1, so that one learning rate suits
+    near and far ones. SH coefficients missing from `sh_degree` start at 0; None keeps the degree.
     """
 
     def __init__(
@@ -65,10 +60,8 @@ class Fields:
     ) -> Bool[Tensor, "N"]:
         """Update the visible Gaussians (with a gradient of the opacity); return their mask.
 
-        Args:
-            gradients: gradients of the parameters.
-            rates, factor: learning rates, and a factor of all, or of the means alone.
-            sh_degree: coefficients of higher degrees are not updated.
+        `factor` multiplies all rates, or those of the means alone. SH of degrees above `sh_degree`
+        are not updated.
         """
         visible = gradients["logits"] != 0
         bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
@@ -109,9 +102,7 @@ class Fields:
     def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Parameters]:
         """Return the origins of the offsets, and the parameters: copies in float32."""
         gaussians = gaussians.map(
-            lambda field: field.detach().to(
-                torch.float32, copy=True, memory_format=torch.contiguous_format
-            )
+            lambda field: field.detach().float().clone(memory_format=torch.contiguous_format)
         )
         sh = gaussians.sh[:, : self.count]
         missing = sh.new_zeros(len(sh), self.count - sh.shape[1], 3)

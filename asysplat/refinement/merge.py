@@ -18,12 +18,9 @@ def merge_cells(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
     """Merge the Gaussians of each cubic cell into their mean, weighted by opacity.
 
     The merged Gaussian has the opacity of all of them one behind the other, clamped to MIN_OPACITY
-    and MAX_OPACITY, and is at least as large as its cell.
-
-    Args:
-        gaussians: [N], N >= 1.
-        cells: side of each Gaussian's cell, > 0, in scene units; rounded to a power of 2, so that
-            cells of one size tile the space, from the minimum corner of all means.
+    and MAX_OPACITY, and is at least as large as its cell. The sides of the `cells`, > 0, in scene
+    units, are rounded to powers of 2, so that cells of one size tile the space, from the minimum
+    corner of all means.
     """
     cell, count = _cell_ids(gaussians.means, cells)
     weights = gaussians.opacities.clamp_min(1e-6)  # transparent Gaussians have a mean, too

@@ -135,23 +135,16 @@ class Refinement:
             sums = list(map(torch.add, sums, of_view)) if sums else of_view
             error += mse / len(chosen)
         gradients = dict(zip(leaves, sums, strict=True))
-        degree = (
-            MAX_SH_DEGREE if settings.every is None else self._steps // settings.every.sh_degree
-        )
-        visible = self.fields.step(
-            gradients, settings.rates, factor, settings.decay_means_alone, degree
-        )
+        every = settings.every
+        degree = MAX_SH_DEGREE if every is None else self._steps // every.sh_degree
+        means_alone = settings.decay_means_alone
+        visible = self.fields.step(gradients, settings.rates, factor, means_alone, degree)
         self._densifier.observe_step(visible, factor)
         self._steps += 1
         return error
 
     def densify(self, progress: float, number: int = 1) -> None:
-        """Prune, add or relocate Gaussians, by the method of the settings.
-
-        Args:
-            progress: see `step`.
-            number: number of this round, counted from 1.
-        """
+        """Prune, add or relocate Gaussians, by the settings' method; `number` counts the rounds."""
         self._densifier.densify(self._views(progress), self._next_count(number))
 
     def _make_densifier(self) -> Densifier:

@@ -83,10 +83,7 @@ class ViewGaussians:
 class AnchorScene:
     """A scene of anchors, each with a feature, OFFSETS offsets, log scales, and three networks.
 
-    Args:
-        points: an anchor is placed in each cell that has one.
-        voxel: side of a cell.
-        seed: seed of the networks' weights.
+    An anchor is placed in each cell, of side `voxel`, that has a point.
     """
 
     def __init__(self, points: Float[Tensor, "P 3"], voxel: float, seed: int = 0):
@@ -115,12 +112,7 @@ class AnchorScene:
         return len(self.anchors) * OFFSETS
 
     def decode(self, camera: Cameras, parameters: Parameters | None = None) -> ViewGaussians:
-        """Compute the Gaussians of one view (Sec. 3.2), differentiable in the parameters.
-
-        Args:
-            camera: [1].
-            parameters: current ones where None.
-        """
+        """Compute the Gaussians of one view (Sec. 3.2), differentiable in given parameters."""
         anchors = self._seen(camera).nonzero()[:, 0]
         parameters = self.optimizer.parameters if parameters is None else parameters
         offsets, features, log_scales = (
@@ -177,14 +169,9 @@ class AnchorScene:
 
     @torch.no_grad()
     def grow(self, wanted: Bool[Tensor, "N 10"], voxel: float, limit: int = sys.maxsize) -> None:
-        """Add an anchor in each empty cell with a wanted Gaussian (Sec. 3.3).
+        """Add an anchor in each empty cell with a wanted Gaussian, up to the limit (Sec. 3.3).
 
         Its feature is the greatest of the anchors of these Gaussians, by component.
-
-        Args:
-            wanted: Gaussians whose cells are to have an anchor.
-            voxel: side of the cells.
-            limit: the greatest number of anchors afterwards.
         """
         anchors, slots = wanted.nonzero(as_tuple=True)
         offsets = self.optimizer.parameters["offsets"][anchors, slots]
@@ -345,13 +332,7 @@ def refine_scaffold(
     """Optimize a scene of anchors, placed at the means of Gaussians, for some seconds or steps.
 
     The published schedule has 30,000 steps: in fewer, rates fall faster, and growth, which begins
-    at `settings.first_round`, ends earlier. With `steps`, the same inputs and seed give the same
-    bits.
-
-    Args:
-        gaussians, views, background, seed, watch: see `asysplat.refinement.refine`.
-        settings: settings of the cells and of growth.
-        seconds, steps: give one of them.
+    at `settings.first_round`, ends earlier. See `asysplat.refinement.refine` for the arguments.
     """
     budget = read_budget(seconds, steps)
     if gaussians.num_gaussians == 0:

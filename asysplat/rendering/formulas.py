@@ -34,18 +34,14 @@ MAX_CENTER_OFFSET = 2.0**30
 
 
 class KernelInputs(NamedTuple):
-    """Arrays or tensors of Gaussians and cameras, or their gradients.
+    """Arrays or tensors of Gaussians and cameras, or their gradients."""
 
-    means [B * N, 3], quats [B * N, 4], scales [B * N, 3], opacities [B * N], sh [B * N, K, 3] of B
-    scenes; cameras [B * V, 20], rows from `camera_rows`.
-    """
-
-    means: Any
-    quats: Any
-    scales: Any
-    opacities: Any
-    sh: Any
-    cameras: Any
+    means: Any  # [B * N, 3]
+    quats: Any  # [B * N, 4]
+    scales: Any  # [B * N, 3]
+    opacities: Any  # [B * N]
+    sh: Any  # [B * N, K, 3]
+    cameras: Any  # [B * V, 20], see `camera_rows`
 
 
 def apply_passes(

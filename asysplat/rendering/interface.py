@@ -22,8 +22,8 @@ MAX_IMAGES = 2**16 - 1  # views of all scenes that a GPU launches programs for
 def single(value: float) -> float:
     """Return the float32 nearest to `value`.
 
-    The renderers that define the constants below compute in float32, where two clamped alphas reach
-    the stop, and float64 has to take the same decisions.
+    The renderers that define these limits compute in float32, where two clamped alphas reach the
+    stop; float64 has to take the same decisions.
     """
     return float(np.float32(value))
 
@@ -32,24 +32,16 @@ def single(value: float) -> float:
 class BlendingLimits:
     """The cut-offs of alpha compositing, which decide the value of a pixel; a PSNR depends on them.
 
-    Args:
-        alpha_max: alpha is clamped to this value.
-        alpha_min: a smaller alpha counts as 0.
-        transmittance_min: the Gaussian that would push the transmittance below this value is
-            dropped, with all behind it.
-        eps2d: variance added to every projected Gaussian, in pixels squared.
-        near: Gaussians whose mean has a depth <= near are culled, in scene units.
-        frustum_margin: the Jacobian is taken inside the view widened by this fraction on each side.
-        compensation_min: minimum of the squared factor of the opacity for antialiasing.
+    The Gaussian that would push the transmittance below its minimum is dropped, with all behind it.
     """
 
-    alpha_max: float = single(0.99)
-    alpha_min: float = single(1 / 255)
+    alpha_max: float = single(0.99)  # alpha is clamped to it
+    alpha_min: float = single(1 / 255)  # a smaller alpha counts as 0
     transmittance_min: float = single(1e-4)
-    eps2d: float = 0.3
-    near: float = 0.01
-    frustum_margin: float = 0.15
-    compensation_min: float = 2.5e-5
+    eps2d: float = 0.3  # variance added to every projected Gaussian, in pixels squared
+    near: float = 0.01  # Gaussians whose mean has at most this depth are culled, in scene units
+    frustum_margin: float = 0.15  # the Jacobian is taken in the view, widened by it on each side
+    compensation_min: float = 2.5e-5  # of the squared factor of the opacity for antialiasing
 
 
 # diff-gaussian-rasterization (Kerbl et al. 2023) and gsplat 1.6; their near planes differ.
@@ -64,25 +56,15 @@ class Culling:
     """Exact culling: work that can be left out without changing a bit of an image or a gradient.
 
     `without_culling` switches kinds off.
-
-    Args:
-        opacity: cull Gaussians below alpha_min before the projection.
-        frustum: cull Gaussians outside the image before their color is computed.
-        extent: end a splat where its own alpha falls below alpha_min, not where that of an opaque
-            splat does.
-        ellipse: cull tiles of a splat's box that its ellipse does not touch.
-        masks: cull tiles without a pixel that counts.
-        rows: cull rows of a tile's pixels that a splat does not reach.
-        opaque: cull splats behind opaque rows and tiles.
     """
 
-    opacity: bool = True
-    frustum: bool = True
-    extent: bool = True
-    ellipse: bool = True
-    masks: bool = True
-    rows: bool = True
-    opaque: bool = True
+    opacity: bool = True  # Gaussians below alpha_min, before the projection
+    frustum: bool = True  # Gaussians outside the image, before their color is computed
+    extent: bool = True  # of a splat beyond its own alpha_min, not only that of an opaque splat
+    ellipse: bool = True  # tiles of a splat's box that its ellipse does not touch
+    masks: bool = True  # tiles without a pixel that counts
+    rows: bool = True  # rows of a tile's pixels that a splat does not reach
+    opaque: bool = True  # splats behind opaque rows and tiles
 
 
 _culling = Culling()
@@ -101,18 +83,11 @@ def without_culling(*kinds: str) -> Generator[None]:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Settings of a rendering.
-
-    Args:
-        limits: cut-offs of alpha compositing.
-        antialiased: lower the opacity by what eps2d adds to a splat's area (Yu et al. 2024).
-        depth: one of DEPTHS, or None.
-        culling: exact culling.
-    """
+    """Settings of a rendering."""
 
     limits: BlendingLimits = INRIA
-    antialiased: bool = False
-    depth: str | None = "expected"
+    antialiased: bool = False  # the opacity is lowered by what eps2d adds to a splat's area
+    depth: str | None = "expected"  # one of DEPTHS, or None
     culling: Culling = field(default_factory=lambda: _culling)
 
     def __post_init__(self):
@@ -144,32 +119,22 @@ class Projections(TensorRecord):
 class RenderOutputs:
     """Images without background; I counts the views of all scenes.
 
-    Args:
-        image: [I, 3, H, W] sum of w_i c_i.
-        alpha: [I, H, W] sum of w_i.
-        transmittance: [I, H, W] 1 - alpha, to float32's relative precision also near 0.
-        depth: [I, H, W] sum of w_i (z_i - depth_origin), or the depth of the Gaussian that takes
-            the transmittance to half or below, 0 where none does; None if settings.depth is None.
-        stats: counts of visible Gaussians, pairs with tiles, and what was culled.
-        depth_origin: [I, H, W] without a gradient, near the blended depths, so that their
-            differences are not lost to rounding; None for 0.
+    The depth is the sum of w_i (z_i - depth_origin), or that of the Gaussian that takes the
+    transmittance to half or below, 0 where none does; None if settings.depth is None. Its origin,
+    without a gradient, is near the blended depths, so that their differences are not lost to
+    rounding; None for 0.
     """
 
-    image: Float[Tensor, "I 3 H W"]
-    alpha: Float[Tensor, "I H W"]
-    transmittance: Float[Tensor, "I H W"]
+    image: Float[Tensor, "I 3 H W"]  # sum of w_i c_i
+    alpha: Float[Tensor, "I H W"]  # sum of w_i
+    transmittance: Float[Tensor, "I H W"]  # 1 - alpha, to float32's relative precision also near 0
     depth: Float[Tensor, "I H W"] | None
     stats: dict[str, int]
     depth_origin: Float[Tensor, "I H W"] | None = None
 
 
 def check_pairs(pairs: int, longest: int = 0) -> None:
-    """Raise InputError if a backend's lists cannot hold so many entries.
-
-    Args:
-        pairs: pairs of Gaussian and tile, at most MAX_PAIRS.
-        longest: Gaussians in the fullest tile, at most MAX_SPLATS_PER_TILE.
-    """
+    """Raise InputError for too many pairs of Gaussian and tile, in all or in the `longest` list."""
     if longest > MAX_SPLATS_PER_TILE:
         raise InputError(
             f"render finds {longest} Gaussians in one tile, and the limit is "
@@ -183,12 +148,7 @@ def check_pairs(pairs: int, longest: int = 0) -> None:
 
 
 def check_splats(images: int, num: int) -> None:
-    """Raise InputError if a GPU cannot number the splats of so many images.
-
-    Args:
-        images: views of all scenes, at most MAX_IMAGES.
-        num: Gaussians of a scene; those of all images together are at most MAX_SPLATS.
-    """
+    """Raise InputError if a GPU cannot number the splats of so many images of `num` Gaussians."""
     if images > MAX_IMAGES:
         raise InputError(
             f"render draws {images} views at once, and the limit is {MAX_IMAGES}: set "

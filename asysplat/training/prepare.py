@@ -22,7 +22,7 @@ from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError, brief, input_error_behind
-from asysplat.models.skips import EarlyExit
+from asysplat.models.network import EarlyExit
 from asysplat.runs.checkpoints import (
     check_checkpoint,
     config_diff,

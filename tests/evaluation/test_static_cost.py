@@ -16,8 +16,7 @@ from asysplat.evaluation.static_cost import (
     true_flops,
 )
 from asysplat.models.attention import CrossAttention, SelfAttention
-from asysplat.models.mamba2 import Mamba2Direction
-from asysplat.models.mamba_vision import MambaVisionMixer
+from asysplat.models.mamba import Mamba2Direction, MambaVisionMixer
 from asysplat.ops.ssd.reference import CHUNK
 
 

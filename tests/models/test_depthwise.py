@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from asysplat.models.depthwise import depthwise_conv
+from asysplat.models.mamba import depthwise_conv
 
 SIZES = [(4, 3), (4, 0), (3, 1)]  # of the kernel, and before
 

@@ -13,7 +13,7 @@ from tiny import NETWORK
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models import EarlyExit
-from asysplat.models.skips import EXACT
+from asysplat.models.network import EXACT
 from asysplat.rendering import render
 from asysplat.scene import Views
 

@@ -45,10 +45,6 @@ class PlaneSweepPrior(nn.Module):
     """Depth from `plane_sweep`, over images shrunk to a size that suits the number of planes.
 
     The cameras set the range of depths, and in views with enough sparse points the points do.
-
-    Args:
-        planes, neighbors: see `plane_sweep`.
-        longest_side: longest side of the swept images in pixels.
     """
 
     def __init__(
@@ -72,12 +68,7 @@ class PlaneSweepPrior(nn.Module):
         if masks is not None:
             masks = whole_pixels(masks, (small.height, small.width))
         estimate = plane_sweep(
-            images,
-            small,
-            planes=self.planes,
-            neighbors=self.neighbors,
-            ranges=ranges,
-            masks=masks,
+            images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges, masks=masks
         )
         return Prior.from_estimate(estimate, views, size)
 
@@ -100,7 +91,6 @@ def plane_sweep(
 
     Args:
         images: RGB in [0, 1].
-        cameras: the images' cameras, [B, V].
         planes: number of inverse depths, at least 4.
         neighbors: most views that each view is compared with.
         backend: "reference" (torch, any device and float type), "cpu", "cuda", or "auto": the

@@ -22,33 +22,24 @@ NEIGHBORHOOD_WEIGHT = 0.05  # against the weight 1 of a pixel's own depth at ful
 
 @dataclass(frozen=True)
 class DepthEstimate:
-    """Depths of all views, and how many other views confirm them.
+    """Depths of all views, and how many other views confirm them."""
 
-    Args:
-        inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where no depth is known.
-        confidence: in [0, 1]; 0 where no other view confirms the depth.
-        votes: see `count_votes`.
-    """
-
-    inverse_depth: Float[Tensor, "*batch V h w"]
-    confidence: Float[Tensor, "*batch V h w"]
-    votes: Consistency
+    inverse_depth: Float[Tensor, "*batch V h w"]  # along the camera's z axis; 0 where unknown
+    confidence: Float[Tensor, "*batch V h w"]  # in [0, 1]; 0 where no other view confirms the depth
+    votes: Consistency  # see `count_votes`
 
 
 @dataclass(frozen=True)
 class Prior(TensorRecord):
-    """Distances and their confidence.
+    """Distances at the pixels of the head's grid, and their confidence.
 
-    Args:
-        distance: along the ray of each pixel of the head's grid, > 0, in scene units.
-        confidence: in [0, 1].
-        opacity: to start from, in (0, 1); views that see the same surface share it. FREE_OPACITY
-            where nothing is to be drawn.
+    The opacity, to start from, is shared by the views that see the same surface, and FREE_OPACITY
+    where nothing is to be drawn.
     """
 
-    distance: Float[Tensor, "B V h w"]
-    confidence: Float[Tensor, "B V h w"]
-    opacity: Float[Tensor, "B V h w"]
+    distance: Float[Tensor, "B V h w"]  # along a pixel's ray, > 0, in scene units
+    confidence: Float[Tensor, "B V h w"]  # in [0, 1]
+    opacity: Float[Tensor, "B V h w"]  # in (0, 1)
 
     @classmethod
     def from_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
@@ -118,9 +109,7 @@ def count_votes(
 ) -> Consistency:
     """Count for each pixel's point the views that see it, that see through it, or that do not.
 
-    Args:
-        inverse, trust, others, projections: see `asysplat.ops.plane_sweep.reference.consistency`.
-        backend: a name for `load_backend`.
+    See `asysplat.ops.plane_sweep.reference.consistency`.
     """
     consistency = load_backend(backend, inverse).consistency
     steps = torch.zeros_like(inverse[..., 0, 0])
@@ -149,10 +138,7 @@ def fill_unknown(
 ) -> Float[Tensor, "B V h w"]:
     """Replace uncertain inverse depths by those around them; 0 if none is known.
 
-    A pyramid of weighted means, from the mean of the whole scene down to each pixel.
-
-    Args:
-        trust: in [0, 1]; its square is the pixel's weight.
+    A pyramid of means, from the whole scene down to each pixel, weighted by the square of `trust`.
     """
     weights, sums = [trust**2], [trust**2 * inverse]
     while max(weights[-1].shape[-2:]) > 1:

@@ -21,15 +21,10 @@ SUBPIXEL = 0.25  # error of a match, pixels
 
 @dataclass(frozen=True)
 class PairwiseProjections:
-    """The projections between all pairs of views, for images of any size.
+    """The projections between all pairs of views, for images of any size."""
 
-    Args:
-        normalized: projections for images of width and height 1; see `matrices`.
-        dtype: data type of the cameras.
-    """
-
-    normalized: Float[Tensor, "B V V 3 4"]
-    dtype: torch.dtype
+    normalized: Float[Tensor, "B V V 3 4"]  # for images of width and height 1; see `matrices`
+    dtype: torch.dtype  # of the cameras
 
     @classmethod
     def from_cameras(cls, cameras: Cameras) -> "PairwiseProjections":

@@ -19,15 +19,8 @@ class Densifier:
     def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
         """Take note of a step of the optimizer, or add to it.
 
-        Args:
-            visible: Gaussians that a view of the step shows.
-            factor: factor of the learning rates.
+        `visible` are the Gaussians that a view of the step shows; `factor` is that of the rates.
         """
 
     def densify(self, views: Views, target: int) -> None:
-        """Prune, add or move Gaussians.
-
-        Args:
-            views: input views.
-            target: number of Gaussians after this round, on an even growth to the limit.
-        """
+        """Prune, add or move Gaussians; with `target`, their number grows evenly to the limit."""

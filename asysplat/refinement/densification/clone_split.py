@@ -28,11 +28,7 @@ MAX_RESET_OPACITY = 0.01
 class CloneSplitDensifier(Densifier):
     """Clones and splits by the gradients since the last round.
 
-    Args:
-        fields: the Gaussians.
-        generator: random generator.
-        max_gaussians: limit of their number.
-        first_reset: step of the first opacity reset, after which large ones are pruned; None: none.
+    After `first_reset`, the step of the first opacity reset, large Gaussians are pruned.
     """
 
     def __init__(
@@ -91,12 +87,8 @@ class ScreenGradients:
         """Clone small and split large Gaussians with large gradients; prune transparent ones.
 
         A clone has the position of its original. Gaussians are added up to the limit, those with
-        the largest gradients first. Afterwards the gradients are reset.
-
-        Args:
-            max_gaussians: the limit.
-            generator: random generator.
-            prune_large: prune those above MAX_SCALE or MAX_RADIUS too.
+        the largest gradients first. With `prune_large`, those above MAX_SCALE or MAX_RADIUS are
+        pruned too. Afterwards the gradients are reset.
         """
         fields, gaussians = self.fields, self.fields.gaussians()
         opaque = gaussians.opacities > MIN_OPACITY
@@ -127,12 +119,8 @@ def screen_gradients(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
     """Compute norms of the gradients of centers' image positions, and the centers' depths.
 
-    Only the projection of the center is considered, not the change of the splat's shape.
-
-    Args:
-        means: centers that the view shows.
-        gradients: gradients of `means`.
-        cameras: the view; its image has sides [-1, 1].
+    Only the projection of the center is considered, not the change of the splat's shape. The view
+    shows all `means`, and its image has sides [-1, 1].
     """
     pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
     depth = (means - pose[:3, 3]) @ pose[:3, 2]

@@ -25,12 +25,7 @@ MAX_COPIES = 51  # Gaussians at one position for which Eq. 9 is evaluated, as in
 
 
 class McmcDensifier(Densifier):
-    """Relocates dead Gaussians and adds copies; noise explores positions.
-
-    Args:
-        fields: the Gaussians.
-        generator: random generator.
-    """
+    """Relocates dead Gaussians and adds copies; noise explores positions."""
 
     def __init__(self, fields: Fields, generator: torch.Generator):
         self.fields, self.generator = fields, generator
@@ -54,13 +49,8 @@ def mcmc_regularizer(gaussians: Gaussians) -> Tensor:
 def relocate(fields: Fields, target: int, generator: torch.Generator) -> None:
     """Move dead Gaussians to live ones sampled by opacity, then add copies sampled likewise.
 
-    Copies at one position render together as their original did. The optimizer state of copies
-    and originals is reset.
-
-    Args:
-        fields: the Gaussians; changed ones are moved to the end.
-        target: number of Gaussians to which copies are added.
-        generator: random generator.
+    Copies, added up to `target` Gaussians, render together with their original as it did. Both get
+    a new optimizer state, and are moved to the end.
     """
     alive = fields.gaussians().opacities > MIN_OPACITY
     if alive.any():

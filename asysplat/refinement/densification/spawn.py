@@ -23,11 +23,7 @@ VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 class ErrorDensifier(Densifier):
     """Prunes faint and unseen Gaussians, and spawns others at pixels with a large error.
 
-    Args:
-        fields: the Gaussians.
-        generator: random generator.
-        background: RGB behind the Gaussians.
-        units: function that computes the unit of the offsets at positions, see `Fields`.
+    `units` computes the unit of the offsets at positions, see `Fields`.
     """
 
     def __init__(
@@ -78,14 +74,8 @@ def spawn_at_errors(
 ) -> Gaussians:
     """Sample pixels in proportion to their error, and return a Gaussian at the depth of each.
 
-    Each has the color of its pixel in the input image.
-
-    Args:
-        views: input views, [V].
-        rendered: their renderings.
-        depth: rendered depth, 0 at the background.
-        count: number of samples; fewer where fewer pixels have an error.
-        generator: random generator.
+    Each has the color of its pixel in the input image. The rendered `depth` is 0 at the background.
+    There are fewer than `count` where fewer pixels have an error.
     """
     error = (views.masked(rendered) - views.images).abs().mean(1)
     error = F.avg_pool2d(error, ERROR_WINDOW, stride=1, padding=ERROR_WINDOW // 2) * (depth > 0)

@@ -44,17 +44,12 @@ VISIBLE, CULLED, OUTSIDE_IMAGE = 1.0, 0.0, -1.0
 
 
 class Projected(NamedTuple):
-    """The outputs of `project`.
+    """The outputs of `project`."""
 
-    splats [images * N, 16], see `splat`, written where visible; counts [images * N] pairs of splat
-    and tile, 0 where culled; counters [images, blocks, COUNTERS]; histograms [images, blocks,
-    tiles] pairs of each tile.
-    """
-
-    splats: np.ndarray
-    counts: np.ndarray
-    counters: np.ndarray
-    histograms: np.ndarray
+    splats: np.ndarray  # [images * N, 16], see `splat`, written where visible
+    counts: np.ndarray  # [images * N] pairs of splat and tile, 0 where culled
+    counters: np.ndarray  # [images, blocks, COUNTERS]
+    histograms: np.ndarray  # [images, blocks, tiles] pairs of each tile
 
 
 class _Batch(NamedTuple):

@@ -73,15 +73,14 @@ class OutputImages(NamedTuple):
 class SavedForBackward(NamedTuple):
     """What `rasterize` saves for `rasterize_backward`.
 
-    transmittance [images, H, W]; stop_ranks [images, H, W] the rank in the list of the first splat
-    that a pixel dropped, NO_STOP if it dropped none; last_entry [tiles] where the tile's pixels
-    were all opaque and its list was left; counters [tiles, COUNTERS].
+    A stop is the rank in the list of the first splat that a pixel dropped, NO_STOP for none. A
+    tile's list is left at its last entry, where all its pixels were opaque.
     """
 
-    transmittance: np.ndarray
-    stop_ranks: np.ndarray
-    last_entry: np.ndarray
-    counters: np.ndarray
+    transmittance: np.ndarray  # [images, H, W]
+    stop_ranks: np.ndarray  # [images, H, W]
+    last_entry: np.ndarray  # [tiles]
+    counters: np.ndarray  # [tiles, COUNTERS]
 
 
 class BlendedDepth(NamedTuple):

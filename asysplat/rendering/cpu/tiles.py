@@ -19,19 +19,13 @@ DIGITS = 4
 
 
 class TileLists(NamedTuple):
-    """The splats of every tile.
+    """The splats of every tile, sorted by Gaussian until `rasterize` sorts them by depth."""
 
-    splats [images * N, 16], see `splat`; first_pair [images * N + 1] index of each splat's first
-    pair of splat and tile, and the number of pairs; first_entry [tiles + 1] start of each tile's
-    list; entries [pairs, 2] splat and pair, sorted by tile, then by Gaussian until `rasterize`
-    sorts them by depth; active [tiles] whether any pixel of the tile counts.
-    """
-
-    splats: np.ndarray
-    first_pair: np.ndarray
-    first_entry: np.ndarray
-    entries: np.ndarray
-    active: np.ndarray
+    splats: np.ndarray  # [images * N, 16], see `splat`
+    first_pair: np.ndarray  # [images * N + 1] index of each splat's first pair; number of pairs
+    first_entry: np.ndarray  # [tiles + 1] start of each tile's list
+    entries: np.ndarray  # [pairs, 2] splat and pair, sorted by tile
+    active: np.ndarray  # [tiles] whether any pixel of the tile counts
 
 
 @inline

@@ -46,10 +46,8 @@ def draw(
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    `centers` receives the gradients of the centers.
-
-    The values of pixels where `masks` is False are arbitrary. Uses all of `settings.culling` but
-    rows.
+    The values of pixels where `masks` is False are arbitrary. `centers` receives the gradients of
+    the centers. Uses all of `settings.culling` but rows.
     """
     if not (gaussians.means.is_cuda or INTERPRETED):
         raise InputError(
@@ -312,13 +310,11 @@ def _project_backward(
     has_depth = settings.depth is not None
     blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
     shape = (frame.images, blocks, CAMERA_GRADIENT)
-    grads = KernelInputs(
-        *(torch.empty_like(field) for field in inputs[:4]),
-        sh=torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None,
-        cameras=torch.zeros(shape, dtype=torch.float64, device=device)
-        if needs["CAMERAS_NEEDED"]
-        else None,
-    )
+    sh = torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None
+    cameras = None
+    if needs["CAMERAS_NEEDED"]:
+        cameras = torch.zeros(shape, dtype=torch.float64, device=device)
+    grads = KernelInputs(*map(torch.empty_like, inputs[:4]), sh, cameras)
     if blocks:
         sum_pairs[(-(-len(lists.splats) // SUM_BLOCK),)](
             counts=lists.counts,

@@ -21,32 +21,27 @@ MAX_OFFSET = tl.constexpr(2.0**30 - 128)  # pixels: twice as many fit int32
 
 
 class TileLists(NamedTuple):
-    """The splats of every tile, by depth; see `cpu.tiles.TileLists`.
-
-    counts [images * N] pairs of each splat; first_pair [images * N]; entries [pairs] the splat of
-    each pair and pairs [pairs] its index, sorted by tile, then by depth; active None if all tiles
-    are.
-    """
+    """The splats of every tile, by depth; see `cpu.tiles.TileLists`."""
 
     splats: Tensor
-    counts: Tensor
-    first_pair: Tensor
+    counts: Tensor  # [images * N] pairs of each splat
+    first_pair: Tensor  # [images * N]
     first_entry: Tensor
-    entries: Tensor
-    pairs: Tensor
-    active: Tensor | None
+    entries: Tensor  # [pairs] splat of each pair, sorted by tile, then by depth
+    pairs: Tensor  # [pairs] index of each of these pairs
+    active: Tensor | None  # None if all tiles are
 
 
 @kernel
 def list_tiles(
     splats,
-    order,
-    counts,
-    box_tiles,
-    ends,
-    tile_of,
-    owners,
-    first_pair,
+    order,  # [num_visible] splats by depth
+    counts,  # [images * N] tiles of each splat
+    box_tiles,  # [programs]
+    ends,  # [num_visible] 1 + the index of a splat's last pair
+    tile_of,  # [pairs]
+    owners,  # [pairs] splat of each pair
+    first_pair,  # [images * N]
     num_visible,
     num,
     height,
@@ -57,11 +52,9 @@ def list_tiles(
     CULL_ELLIPSE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Visit the tiles of BLOCK splats, in the `order` [num_visible] of their depths.
+    """Visit the tiles of BLOCK splats.
 
-    Without WRITE, write the counts [images * N] of tiles and box_tiles [programs]. With WRITE,
-    write tile_of and owners [pairs], the tile and splat of each pair, and first_pair [images * N];
-    ends [num_visible] is 1 + the index of a splat's last pair.
+    Without WRITE, write counts and box_tiles; with WRITE, write tile_of, owners and first_pair.
     """
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = rank < num_visible

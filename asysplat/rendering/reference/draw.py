@@ -21,8 +21,8 @@ def draw(
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, all of one float type.
 
-    Ignores `settings.culling`, and so draws masked pixels too.
-    `centers` receives the gradients of the centers.
+    Ignores `settings.culling`, and so draws masked pixels too. `centers` receives the gradients of
+    the centers.
     """
     splats = project(gaussians, cameras, settings, centers)
     images = cameras.intrinsics.shape[0] * cameras.num_views

@@ -20,25 +20,18 @@ BOUNDS_MARGIN = 1e-3  # pixels, more than the rounding error of an extent
 class Splats:
     """M visible pairs (image, Gaussian), sorted by image, then by depth, then by index.
 
-    Args:
-        images: [M] index of the image, batch and views flattened.
-        xy: [M, 2] center in pixels.
-        whitening: [M, 3] = (a, b, c); a pixel at (dx, dy) from the center has
-            alpha = opacity * exp(-((a dx + b dy)^2 + (c dy)^2) / 2).
-        opacities: [M].
-        colors: [M, 3], >= 0.
-        depths: [M] z in the camera's frame, in scene units.
-        first, last: [M, 2] inclusive range (x, y) of the pixels that can have alpha >= alpha_min.
+    With the whitening (a, b, c), a pixel at (dx, dy) from the center has
+    alpha = opacity * exp(-((a dx + b dy)^2 + (c dy)^2) / 2).
     """
 
-    images: Int[Tensor, "M"]
-    xy: Float[Tensor, "M 2"]
+    images: Int[Tensor, "M"]  # index of the image, batch and views flattened
+    xy: Float[Tensor, "M 2"]  # center in pixels
     whitening: Float[Tensor, "M 3"]
     opacities: Float[Tensor, "M"]
-    colors: Float[Tensor, "M 3"]
-    depths: Float[Tensor, "M"]
-    first: Int[Tensor, "M 2"]
-    last: Int[Tensor, "M 2"]
+    colors: Float[Tensor, "M 3"]  # >= 0
+    depths: Float[Tensor, "M"]  # z in the camera's frame, in scene units
+    first: Int[Tensor, "M 2"]  # first pixel (x, y) that can have alpha >= alpha_min
+    last: Int[Tensor, "M 2"]  # last such pixel
 
 
 class Footprint(NamedTuple):
@@ -58,13 +51,9 @@ def project(
     settings: RenderSettings,
     centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> Splats:
-    """Project the Gaussians of every scene to every view.
+    """Project Gaussians [B, N] to views [B, V] of zero skew; image b * V + v is view v of scene b.
 
-    Args:
-        gaussians: with one batch dimension, [B, N].
-        cameras: [B, V], zero skew; image b * V + v is view v of scene b.
-        settings: limits and antialiasing.
-        centers: receives the gradients of the centers.
+    `centers` receives the gradients of the centers.
 
     Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within the extent,
     and Gaussians that do not project to finite numbers (NaN, infinity, a zero quaternion).
@@ -72,11 +61,9 @@ def project(
     size = (cameras.width, cameras.height)
     images, indices = select_visible(gaussians, cameras, settings)
     # Only visible pairs enter the graph: culled ones cannot send a NaN back.
+    fields = (gaussians.means, gaussians.quats, gaussians.scales)
     footprint = project_footprints(
-        *(
-            field.flatten(0, 1).index_select(0, indices)
-            for field in (gaussians.means, gaussians.quats, gaussians.scales)
-        ),
+        *(field.flatten(0, 1).index_select(0, indices) for field in fields),
         cameras.cam_to_world.flatten(0, 1).index_select(0, images),
         cameras.intrinsics.flatten(0, 1).index_select(0, images),
         size,
@@ -87,13 +74,8 @@ def project(
     sh = gaussians.sh.flatten(0, 1).index_select(0, indices)
     xy = footprint.xy
     if centers is not None:
-        xy = (
-            xy
-            + (centers - centers.detach())[
-                *(images // cameras.num_views, images % cameras.num_views),
-                indices % gaussians.num_gaussians,
-            ]
-        )
+        scene, view = images // cameras.num_views, images % cameras.num_views
+        xy = xy + (centers - centers.detach())[scene, view, indices % gaussians.num_gaussians]
     return Splats(
         images=images,
         xy=xy,

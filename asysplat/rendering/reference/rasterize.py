@@ -28,15 +28,9 @@ def rasterize(
 ) -> Float[Tensor, "T C P"]:
     """Composite sum_i w_i values_i at every pixel of every tile, front to back.
 
-    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023.
-
-    Args:
-        splats: M splats, sorted by depth within their image.
-        values: values of each splat.
-        lists: from `list_tiles`; P = size * size pixels a tile, row by row.
-        limits: the cut-offs.
-        median: take the last value from the splat at which the transmittance falls to half or
-            below; 0 where it never does.
+    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023. The P = size * size pixels of a tile
+    go row by row. With `median`, the last value is that of the splat at which the transmittance
+    falls to half or below; 0 where it never does.
     """
     packed = torch.cat((splats.xy, splats.whitening, splats.opacities[:, None], values), -1)
     # The last row is the padding, with opacity 0.

@@ -12,21 +12,14 @@ from asysplat.rendering.reference.project import Splats
 
 @dataclass(frozen=True)
 class TileLists:
-    """Depth-ordered splats of every tile; tiles are numbered image by image, row by row.
+    """Depth-ordered splats of every tile; tiles are numbered image by image, row by row."""
 
-    Args:
-        size: tiles are size x size pixels.
-        images, rows, columns: the grid of tiles.
-        splats: [pairs] splat of every pair of splat and tile, sorted by tile, then by depth.
-        lengths: [T] number of pairs of each tile.
-    """
-
-    size: int
-    images: int
+    size: int  # pixels a side
+    images: int  # the grid of tiles has images x rows x columns
     rows: int
     columns: int
-    splats: Int[Tensor, "pairs"]
-    lengths: Int[Tensor, "T"]
+    splats: Int[Tensor, "pairs"]  # splat of every pair, sorted by tile, then by depth
+    lengths: Int[Tensor, "T"]  # number of pairs of each tile
 
     def origins(self, tiles: Int[Tensor, "t"]) -> Int[Tensor, "t 2"]:
         """Return the pixel (x, y) at the upper left corner of the given tiles."""
