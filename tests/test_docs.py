@@ -62,7 +62,7 @@ def test_photographs_reach_the_scene_by_a_short_way(repository, tmp_path):
     lines = [line.split() for line in done.stdout.splitlines()]
     entered = {words[1]: int(words[0]) for words in lines if words[:1] and words[0].isdigit()}
     assert entered["scene.py"] == 1, done.stderr
-    assert entered["export/formats/ply.py"] <= 21, done.stdout
+    assert entered["export/formats/ply.py"] <= 18, done.stdout
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Fit the Gaussians of one scene to its images: initialization, merging, refinement."""
 
-from asysplat.refinement.merge import merge_to_limit
+from asysplat.refinement.init import merge_to_limit
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine
 from asysplat.refinement.scaffold_gs import (
     SCAFFOLD_GS,

@@ -22,7 +22,7 @@ from asysplat.ops.image_loss import image_loss
 from asysplat.ranges import Count, Positive, check_options
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
-from asysplat.refinement.densification.relocate import McmcDensifier
+from asysplat.refinement.densification.relocate import McmcDensifier, mcmc_regularizer
 from asysplat.refinement.densification.spawn import ErrorDensifier
 from asysplat.refinement.fields import (
     MAX_SH_DEGREE,
@@ -181,7 +181,8 @@ class Refinement:
             loss = F.mse_loss(target.masked(image), target.images)
         else:
             loss = image_loss(image, target.images, self.settings.ssim, target.masks).sum()
-        loss = loss + self._densifier.regularizer(gaussians)
+        if self.settings.densify == "mcmc":
+            loss = loss + mcmc_regularizer(gaussians)
         gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])
         if correction:
             correction_gradients = dict(zip(correction, gradients[len(leaves) :], strict=True))

@@ -11,7 +11,7 @@ from asysplat.kernels.self_check import relative_error
 from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import load_backend
 from asysplat.refinement.densification.relocate import split_opacity_and_scale
-from asysplat.refinement.merge import merge_to_limit
+from asysplat.refinement.init import merge_to_limit
 from asysplat.rendering import render
 from asysplat.scene import Gaussians
 

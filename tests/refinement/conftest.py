@@ -5,8 +5,7 @@ import torch
 
 from asysplat.data import ProceduralScene
 from asysplat.models.prior import Prior
-from asysplat.refinement.init import gaussians_from_prior
-from asysplat.refinement.merge import merge_to_limit
+from asysplat.refinement.init import gaussians_from_prior, merge_to_limit
 
 
 @pytest.fixture(scope="session")

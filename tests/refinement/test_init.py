@@ -10,14 +10,18 @@ from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.models.prior import Prior
 from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.init import (
+    MAX_OPACITY,
+    MIN_OPACITY,
     POINT_OPACITY,
+    SPREAD,
     gaussians_from_points,
     gaussians_from_prior,
     initial_gaussians,
+    merge_cells,
+    merge_to_limit,
     sample_colors,
 )
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
-from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
 from asysplat.refinement.settings import DEFAULT
 from asysplat.scene import Cameras, Views
 

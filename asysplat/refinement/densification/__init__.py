@@ -3,15 +3,11 @@
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Cameras, Views
 
 
 class Densifier:
     """Keeps the Gaussians as they are; a method of densification overrides what it needs."""
-
-    def regularizer(self, gaussians: Gaussians) -> Tensor | float:
-        """Compute a term that is added to the loss of each view."""
-        return 0.0
 
     def observe_view(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
         """Take note of the gradients of the offsets from one view."""

@@ -30,9 +30,6 @@ class McmcDensifier(Densifier):
     def __init__(self, fields: Fields, generator: torch.Generator):
         self.fields, self.generator = fields, generator
 
-    def regularizer(self, gaussians: Gaussians) -> Tensor:
-        return mcmc_regularizer(gaussians)
-
     def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
         inject_position_noise(self.fields, factor, self.generator)
 
