@@ -2,11 +2,9 @@
 
 import json
 from copy import deepcopy
-from io import StringIO
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from benchmarks.compare import compare
 from benchmarks.options import SUITES, find_suite
@@ -20,21 +18,13 @@ MEASURED |= {"stability": ("error", 10), "formats": ("write", 10), "device": ("k
 MEASURED |= {"machine_code": ("instructions", 2), "systems": ("psnr", 0.1)}
 
 
-def test_every_suite_has_a_committed_result():
-    assert {path.stem for path in FILES} == set(SUITES)
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(FOLDER)))
 def test_committed_results_are_shown_and_compared(path):
+    assert {path.stem for path in FILES} == set(SUITES)
     results, suite = json.loads(path.read_text()), find_suite(path.stem)
     assert path.read_text() == format_json(results) + "\n"
-    console = Console(width=500, file=StringIO())
-    for table in suite.tables(results):
-        assert table.row_count > 0
-        console.print(table)
-    shown = " ".join(console.file.getvalue().split())  # notes are wrapped
-    assert results["machine"]["cpu"] in shown
+    assert all(table.row_count > 0 for table in suite.tables(results))
     if hasattr(suite, "plot"):
         assert suite.plot(results).axes
 

@@ -11,7 +11,6 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.errors import InputError
 from asysplat.models import head
 from benchmarks.stability.comparison import StabilityCase, compare_to_reference, unit_roundoff
 from benchmarks.stability.hostile import HOSTILE_GAUSSIANS
@@ -22,7 +21,7 @@ FEW = {
     "areas": ["renderer", "refinement"],
     "models": ["asysplat_plane_sweep"],
     "overrides": TINY,
-    "views": [1],
+    "views": [1, 8],
     "training_steps": 3,
     "refinement_steps": 3,
 }
@@ -132,13 +131,8 @@ def nan_gradient(values, bound):
 @pytest.mark.medium
 def test_a_nan_gradient_is_red(measured, monkeypatch):
     cases = [("network", "noise photographs"), ("training", "3 steps on hostile batches")]
-    assert all(measured(*case)[0]["green"] for case in [*cases, ("network", "white photographs")])
+    assert all(measured(*case)[0]["green"] for case in cases)
     monkeypatch.setattr(head, "squash", nan_gradient)
     for case in cases:
         (row,) = measured(*case)
         assert not row["green"] and row["nan"] > 0, case
-
-
-def test_unknown_options_are_named(options):
-    with pytest.raises(InputError, match=r"^stability\.areas=weather is unknown: .*operators, pr"):
-        measure(OmegaConf.merge(options, {"stability": {"areas": ["weather"]}}), Console())
