@@ -142,7 +142,7 @@ def test_smaller_images_are_means_over_areas_and_edges_are_color_changes():
 
 
 def test_projections_for_images_of_any_size():
-    """They equal those of resized cameras, and points projected one by one."""
+    """They are those of points that resized cameras project one by one."""
     cameras = turned(four_cameras(), 20)
     cameras = Cameras(
         cameras.intrinsics * torch.tensor([1, 1.2, 1])[:, None], cameras.cam_to_world, 24, 32
@@ -150,9 +150,6 @@ def test_projections_for_images_of_any_size():
     others = torch.tensor([[[1, 2], [3, -1], [0, 3], [2, 1]]])
     matrix = PairwiseProjections.from_cameras(cameras).matrices(others, 12, 8)
     small = cameras.resized(12, 8)
-    torch.testing.assert_close(
-        matrix, PairwiseProjections.from_cameras(small).matrices(others, 12, 8)
-    )
     pixel, depth = torch.tensor([3.5, 7.5, 1], dtype=torch.float64), 2.5
     for view, chosen in enumerate(others[0].tolist()):
         inside = torch.linalg.inv(small.intrinsics[0, view]) @ pixel * depth

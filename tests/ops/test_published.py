@@ -19,18 +19,6 @@ def test_selective_scan_of_mamba_ssm():
     torch.testing.assert_close(selective_scan(x, dt, A, B, C, D), expected)
 
 
-def test_ssd_of_mamba_ssm():
-    published = pytest.importorskip(
-        "mamba_ssm.modules.ssd_minimal", exc_type=ImportError
-    ).ssd_minimal_discrete
-    x, dt = torch.randn(2, 128, 3, 4), torch.rand(2, 128, 3)
-    A, D = -torch.rand(3) - 0.1, torch.randn(3)
-    B, C = torch.randn(2, 2, 128, 5)
-    # Steps are multiplied in before, and B and C have a dimension of groups of heads.
-    expected, _ = published(x * dt[..., None], dt * A, B[:, :, None], C[:, :, None], block_len=32)
-    torch.testing.assert_close(ssd(x, dt, A, B, C, D), expected + D[:, None] * x)
-
-
 def test_ssd_in_the_mamba2_of_transformers():
     transformers = pytest.importorskip("transformers")
     modeling = pytest.importorskip("transformers.models.mamba2.modeling_mamba2")

@@ -1,7 +1,4 @@
-"""Run tests of the CPU kernels again with bounds checks, in processes whose memory is poisoned.
-
-All of them: NUMBA_BOUNDSCHECK=1 pytest tests/ops tests/stress tests/refinement/test_adam.py
-"""
+"""Tests of the CPU kernels run again with bounds checks, in processes whose memory is poisoned."""
 
 import os
 import subprocess
@@ -24,6 +21,7 @@ ONE, EIGHT, LAST = np.float32(1), np.float32(8), np.float32(15)
 QUICK = ("stress/test_checked.py", "ops/test_image_loss.py")
 CASES = "step_out or computes"
 ALL = ("stress", "ops", "refinement/test_adam.py")
+slow = pytest.mark.slow
 NOT_LONG = "test and not long and not interpreter"
 
 
@@ -57,19 +55,31 @@ def test_a_step_out_of_an_array_is_an_error(which):
 @pytest.mark.skipif(INTERPRETED or CHECKED, reason="this is such a process")
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is poisoned by glibc")
 @pytest.mark.parametrize(
-    "paths, cases, fill",
+    "paths, cases, marked, fill",
     [
-        pytest.param(QUICK, CASES, FILLS[0], id="quick"),
+        pytest.param(QUICK, CASES, "not slow", FILLS[0], id="quick"),
         *[
-            pytest.param(ALL, NOT_LONG, fill, id=f"all, {fill:x}", marks=pytest.mark.slow)
+            pytest.param(ALL, NOT_LONG, "not slow", fill, id=f"all, {fill:x}", marks=slow)
             for fill in FILLS
         ],
+        pytest.param(ALL[:1], "thousand_steps", "slow", FILLS[0], id="soak", marks=slow),
     ],
 )
-def test_kernels_with_bounds_checks_and_in_poisoned_memory(repository, paths, cases, fill):
+def test_kernels_with_bounds_checks_and_in_poisoned_memory(repository, paths, cases, marked, fill):
     files = [str(repository / "tests" / path) for path in paths]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files, "-k", cases],
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-p",
+            "no:cacheprovider",
+            *files,
+            "-k",
+            cases,
+            "-m",
+            marked,
+        ],
         # Malloc fills its memory with the complement.
         env={
             **os.environ,
