@@ -53,15 +53,13 @@ def opacity(inverse, votes, confidence):
     return Prior.from_estimate(estimate, views, inverse.shape[-2:]).opacity
 
 
-def test_all_views_agree_on_a_wall():
+def test_all_views_agree_on_a_wall_and_contradict_a_depth_that_is_too_near(monkeypatch):
     found = check_wall()
     assert (found.agreeing[INNER] == 3).all() and (found.containing[INNER] == 3).all()
     assert not found.contradicting.any()
     assert (found.containing[:, 0, :, 0] < 3).all()  # the left border is outside other images
     assert (found.agreeing == found.containing).all()
 
-
-def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(monkeypatch):
     trust = torch.ones(1, 4, 24, 32, dtype=torch.float64)
     found = check_wall(halved=[3], trust=trust)
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 3).all()
@@ -71,7 +69,7 @@ def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(m
     assert (found.agreeing[:, :3][INNER] == 2).all() and not found.contradicting[:, :3].any()
     monkeypatch.setattr(reference, "PIXELS_AT_ONCE", 1)
     assert all(map(torch.equal, check_wall(halved=[3], trust=trust), found))
-    trust[:, 0] = 0.25
+    trust[:, 0] = 0.25  # votes count as much as they are trusted
     found = check_wall(halved=[3], trust=trust)
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 2.25).all()
     assert (found.agreeing[:, 1][:, 4:-4, 12:-12] == 1.25).all()

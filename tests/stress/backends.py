@@ -124,6 +124,14 @@ def assert_close(
         assert error <= slack * backend.gradient_error, name
 
 
+def assert_exact(backend: Backend, *scene, slack=1.0, names=INPUTS, **options) -> Result:
+    """Render with the backend, and compare outputs and gradients with the float64 reference."""
+    result, exact = (both_ways(each, *scene, **options) for each in (backend, EXACT))
+    assert result.is_finite()
+    assert_close(backend, result, exact, slack, names)
+    return result
+
+
 def max_error(value: Tensor, exact: Tensor) -> float:
     return float((value.double() - exact.double()).abs().amax())
 

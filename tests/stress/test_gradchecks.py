@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_gradient
+from backends import BACKGROUND, FIELDS, assert_exact, random_gradient
 
 from asysplat.rendering import INRIA, render
 from asysplat.scene import Gaussians
@@ -51,9 +51,7 @@ def test_every_gradient_equals_finite_differences(soft_scene):
 
 def test_every_gradient_equals_that_of_the_reference(fast_backend, soft_scene):
     gaussians, cameras, options = soft_scene
-    scene = gaussians.to(torch.float32), cameras.to(torch.float32)
-    result, exact = (both_ways(backend, *scene, **options) for backend in (fast_backend, EXACT))
-    assert_close(fast_backend, result, exact)
+    assert_exact(fast_backend, gaussians.to(torch.float32), cameras.to(torch.float32), **options)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.1], ids="{:g} pixels".format)
@@ -69,8 +67,9 @@ def test_the_floor_of_the_compensation(backend, make_scene, scale):
     def grad_output(name, output):  # all gradients of one sign, so that none cancel
         return torch.full_like(output, float(name == "alpha"))
 
-    result = both_ways(backend, gaussians, cameras, grad_output=grad_output, antialiased=True)
+    names = ("scales", "opacities")
+    result = assert_exact(
+        backend, gaussians, cameras, grad_output=grad_output, names=names, antialiased=True
+    )
     share = max(scale**4 / (scale**2 + INRIA.eps2d) ** 2, INRIA.compensation_min)
     assert float(result.alpha[0, 6, 8]) == pytest.approx(share**0.5, rel=1e-5)
-    exact = both_ways(EXACT, gaussians, cameras, grad_output=grad_output, antialiased=True)
-    assert_close(backend, result, exact, names=("scales", "opacities"))
