@@ -78,10 +78,9 @@ def check_backend(scene, backend, device="cpu"):
     assert torch.allclose(found.radii.cpu().double(), exact.radii, rtol=1e-4)
 
 
-def test_the_cpu_backend_has_the_gradients_of_the_reference_and_the_others_keep_their_bits(
-    make_scene,
-):
+def test_the_cpu_backend_has_the_gradients_of_the_reference(make_scene):
     check_backend(make_scene(count=40, views=2, height=37, width=50), "cpu")
+    # The gradients of the others keep their bits.
     scene = make_scene(count=40, views=2, dtype=torch.float32)
     (_, leaves), (_, others) = (center_gradients(scene, "cpu", asked) for asked in (True, False))
     assert torch.equal(leaves.means.grad, others.means.grad)

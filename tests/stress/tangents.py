@@ -21,8 +21,7 @@ def tangent_scene(
     """Make Gaussians [N] of sigma 1 to 10 pixels, whose boxes touch tile edges, and one camera.
 
     A quarter of the boxes each end at a tile's right, left, bottom or top edge, give or take BAND,
-    one in eight of them in both directions. The field of view is so narrow that moving Gaussians
-    changes no shape.
+    one in eight of them in both directions; so far away that moving them changes no shape.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -21,20 +21,18 @@ def make_scene(make_scene):
     return partial(make_scene, height=7, width=9) if INTERPRETED else make_scene
 
 
+def repeated(record, count):
+    return record.map(lambda t: t.expand(count, *t.shape).clone())
+
+
 def spoiled(make_scene, count, **values):
-    """Make `count` scenes, Gaussian 3 of each with its own of these values; return them, and the
-    scenes without it, and their cameras."""
+    """`count` scenes, Gaussian 3 of each with its own of these values; scenes without it."""
     gaussians, cameras = make_scene(views=2, dtype=torch.float32)
     scenes = repeated(gaussians, count)
     for name, column in values.items():
         getattr(scenes, name)[:, 3] = torch.tensor(column)
     clean = gaussians.keep(torch.arange(12) != 3)
     return scenes, repeated(clean, count), repeated(cameras, count)
-
-
-def repeated(record, count):
-    """Return a batch of copies."""
-    return record.map(lambda t: t.expand(count, *t.shape).clone())
 
 
 @pytest.mark.parametrize(
