@@ -21,6 +21,7 @@ STRESS = {
     "extremes": "not alpha and not gsplat",
     "gradchecks": "",
     "memory_and_types": "strided or bfloat16",
+    "needles": "needles",
     "properties": "cropping",
     "sizes": "odd and not 4096",
     "threads_and_order": "equal_depths",
