@@ -52,9 +52,7 @@ def look_up_backend(
 def choose_fastest(x: Tensor, fallback: str, check: str) -> str:
     """Return the name of the fastest backend for the device and dtype of x that is right there.
 
-    Args:
-        fallback: name of the backend in torch, which takes every device and dtype.
-        check: name of the function that checks the kernels on a GPU, see `are_kernels_right`.
+    The backend `fallback` takes every device and dtype. For `check`, see `are_kernels_right`.
     """
     if x.dtype == torch.float64:
         return fallback
@@ -87,12 +85,9 @@ def check_kernel_backend(operator: str, backend: str, x: Tensor) -> None:
 
 
 def check_shape(operator: str, name: str, tensor: Tensor, shape: object, reason: str = "") -> None:
-    """Raise InputError unless a tensor has the expected shape.
+    """Raise InputError unless a tensor has the expected shape; `reason` continues the message.
 
-    Args:
-        shape: expected shape; a string, such as "[B, V, H, W]", equals no tensor's: it is for a
-            tensor whose number of dimensions is known to be wrong.
-        reason: continuation of the message after the expected shape.
+    A string, such as "[B, V, H, W]", equals no shape: it is for a wrong number of dimensions.
     """
     if tuple(tensor.shape) != shape:
         raise InputError(

@@ -36,12 +36,9 @@ class KernelResults(NamedTuple):
 def are_kernels_right(check: str, device: torch.device) -> bool:
     """Check kernels on their first use on a GPU, or read the verdict of an earlier process.
 
-    A verdict holds for one kind of GPU, driver, version of torch and Triton, and source.
-
-    Args:
-        check: function as "module:name" that takes a device and the name of a backend, runs an
-            operator's kernels and their reference, and returns `relative_errors`.
-        device: GPU.
+    A verdict holds for one kind of GPU, driver, version of torch and Triton, and source. `check`
+    names, as "module:name", a function that takes a device and the name of a backend, runs an
+    operator's kernels and their reference, and returns `relative_errors`.
     """
     # Nothing can be compared while a compiler traces or a graph is captured.
     if torch.compiler.is_compiling() or torch.cuda.is_current_stream_capturing():

@@ -16,11 +16,8 @@ CHANGING = {"num", "num_visible", "num_splats", "views", "first", "length", "chu
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile a function as a kernel, without the wrapper that a type checker put around it.
-
-    It is compiled once for all values of CHANGING.
-    """
-    function = inspect.unwrap(function)
+    """Compile a function as a kernel, once for all values of CHANGING."""
+    function = inspect.unwrap(function)  # without a type checker's wrapper
     changing = [name for name in inspect.signature(function).parameters if name in CHANGING]
     return triton.jit(function, do_not_specialize=changing)
 

@@ -40,7 +40,6 @@ class AsySplat(TokenNetwork):
         appearance_layers: N_v.
         fine_to_coarse, coarse_to_fine: components of the bilateral link.
         fusion: component that makes the tokens that Gaussians are predicted from.
-        head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
         widths, prior: see TokenNetwork.
     """

@@ -105,10 +105,7 @@ class ConvBlocks(nn.Module):
 
 
 class CrossAttention(nn.Module):
-    """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each view.
-
-    Queries, keys and values are `inner_width` wide.
-    """
+    """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each view."""
 
     def __init__(self, shape: StageShape, context_width: int, inner_width: int):
         super().__init__()

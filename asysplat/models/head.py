@@ -80,12 +80,8 @@ class GaussianHead(nn.Module, ABC):
             zeros = views.images.new_zeros(())
             raw = zeros.expand(*views.images.shape[:2], *size, sum(self.splits))
         else:
-            raw = rearrange(
-                self.decode(self.norm(features)),
-                "b v h w (p q z) -> b v (h p) (w q) z",
-                p=self.patch,
-                q=self.patch,
-            )
+            pattern, side = "b v h w (p q z) -> b v (h p) (w q) z", self.patch
+            raw = rearrange(self.decode(self.norm(features)), pattern, p=side, q=side)
         with without_autocast(raw):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)

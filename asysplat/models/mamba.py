@@ -102,8 +102,9 @@ class MambaVisionMixer(nn.Module):
         half, dt_rank = width // 2, max(1, width // 16)
         self.splits = (dt_rank, state_size, state_size)
         self.project = nn.Linear(width, width, bias=False)
-        self.conv_scan = self._conv(half)
-        self.conv_gate = self._conv(half)
+        self.conv_scan, self.conv_gate = (
+            nn.Conv1d(half, half, VISION_KERNEL, groups=half, bias=False) for _ in range(2)
+        )
         self.x_proj = nn.Linear(half, dt_rank + 2 * state_size, bias=False)
         self.dt_proj = nn.Linear(dt_rank, half)
         self.A_log = nn.Parameter(torch.arange(1.0, state_size + 1).log().repeat(half, 1))
@@ -111,10 +112,6 @@ class MambaVisionMixer(nn.Module):
         self.out = nn.Linear(width, width, bias=False)
         with torch.no_grad():  # steps between 1e-3 and 1e-1 (Gu and Dao 2023, Sec. 3.6)
             self.dt_proj.bias.copy_(inverse_softplus(log_uniform(half, 1e-3, 1e-1)))
-
-    @staticmethod
-    def _conv(channels: int) -> nn.Conv1d:
-        return nn.Conv1d(channels, channels, VISION_KERNEL, groups=channels, bias=False)
 
     def forward(self, sequences: Float[Tensor, "F L d"]) -> Float[Tensor, "F L d"]:
         x, gate = self.project(sequences).chunk(2, dim=-1)
@@ -132,10 +129,7 @@ def depthwise_conv(
     bias: Float[Tensor, " C"] | None,
     before: int,
 ) -> Float[Tensor, "B L C"]:
-    """Convolve each token with `before` tokens before it and K - 1 - before tokens after it.
-
-    The result has the tokens' type.
-    """
+    """Convolve each token with `before` tokens before it and K - 1 - before tokens after it."""
     with without_autocast(tokens):
         bias = None if bias is None else bias.to(tokens.dtype)
         return _DepthwiseConv.apply(tokens, weight.to(tokens.dtype), bias, before)

@@ -171,10 +171,7 @@ class ResidualBlock(nn.Module):
 
 
 class CrossViewLayer(nn.Module):
-    """Attention within each window of a view, then to the same window of all other views.
-
-    Where `shifted`, windows are moved by half their size (Swin).
-    """
+    """Attention within each window of a view, then to the same window of all other views."""
 
     def __init__(self, width: int, shifted: bool):
         super().__init__()
@@ -189,6 +186,7 @@ class CrossViewLayer(nn.Module):
 
     def forward(self, x: Float[Tensor, "B V h w c"]) -> Float[Tensor, "B V h w c"]:
         _, count, height, width, _ = x.shape
+        # By half of a window, as in Swin.
         shift = [side // WINDOWS // 2 if self.shifted else 0 for side in (height, width)]
         back = [-s for s in shift]
         visible = same_region((height, width), shift, x.device)
@@ -287,10 +285,7 @@ def cost_volume(
 
 
 class UNet(nn.Module):
-    """A U-Net of equal width at each level, whose coarsest level attends to all views.
-
-    Each level has half the resolution of the one before.
-    """
+    """A U-Net of equal width at each level, whose coarsest level attends to all views."""
 
     def __init__(self, width: int, levels: int):
         super().__init__()

@@ -24,14 +24,10 @@ from asysplat.scene import Gaussians, Views
 
 @dataclass(frozen=True, config=configured("speed"))
 class EarlyExit:
-    """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing.
+    """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing."""
 
-    From the first on, the network's `skippable_layers` are skipped; from the second on, the whole
-    network: the Gaussians are the prior's own.
-    """
-
-    skip_layers_above: PositiveFraction | None = None
-    skip_network_above: PositiveFraction | None = None
+    skip_layers_above: PositiveFraction | None = None  # skips the network's `skippable_layers`
+    skip_network_above: PositiveFraction | None = None  # the Gaussians are the prior's own
 
 
 EXACT = EarlyExit()
@@ -173,9 +169,6 @@ class TokenNetwork(Network):
     Outside of training it exits early at the thresholds of `early_exit`, by default never;
     `early_exit_fractions` has the fractions that the last prediction skipped: of the network (0 or
     1) and of its layers.
-
-    Args:
-        patch, prior, prune: see Network.
     """
 
     head: GaussianHead

@@ -19,7 +19,7 @@ class SingleBranch(TokenNetwork):
 
     Args:
         widths, prior, prune: see TokenNetwork; `widths.fine` is not used.
-        stage_ratios, stage_layers, blocks, head: see AsySplat; each stage has a layer mix.
+        stage_ratios, stage_layers, blocks: see AsySplat; each stage has a layer mix.
         merges: whether 2 x 2 tokens become one, before each stage.
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come first in the sequence and have no place.

@@ -38,7 +38,6 @@ class Stage(nn.Module):
         layers: the layer mix, counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape, as in conf/model/blocks.yaml.
         merge: whether 2 x 2 tokens become one.
-        has_global: whether there are global tokens.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The common parts of both scans: checks, the choice of a backend, and their operators in torch.
+"""What both scans share: checks, the choice of a backend, operators in torch, the recurrence.
 
 The backends "reference" and "chunked" are functions in torch. "cpu" and "cuda" are modules of
 kernels, registered as one operator, which autograd, torch.compile, autocast, the meta device and
@@ -16,6 +16,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.flop_counter import register_flop_formula
 
@@ -51,9 +52,7 @@ class Scan:
     """A scan over dimension 1, in fp32 at least.
 
     Args:
-        name: "ssd" or "selective_scan".
         axes: axes of each input, such as "B L N"; the shape of x and N determine all sizes.
-        torch_backends: functions in torch, by the name of their backend.
         count_flops: (shape of x, shape of B) -> FLOPs of the forward and of the backward pass.
         largest: greatest sizes of the axes whose size must be a power of two from 16 on for "cuda".
     """
@@ -129,10 +128,7 @@ class Scan:
 
 
 def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Register asysplat::<name> and its backward pass with torch, and return the former.
-
-    It maps (backend, x, dt, A, B, C, D, reverse, keep) to (y, saved state).
-    """
+    """Register asysplat::<name> and its backward pass with torch, and return the former."""
     tensors = "Tensor x, Tensor dt, Tensor A, Tensor B, Tensor C, Tensor D"
     kernels = partial(load_kernels, name)
 
@@ -184,3 +180,72 @@ def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tupl
         return count_flops(x_shape, B_shape)[1]
 
     return forward
+
+
+def linear_recurrence(
+    decay: Float[Tensor, "L *state"], inputs: Float[Tensor, "L *state"]
+) -> Float[Tensor, "L *state"]:
+    """Return all h_t = decay_t h_{t-1} + inputs_t with h_{-1} = 0; time is the first dimension.
+
+    It is one operator of torch: the meta device and the FLOP counter see it as a whole. A step is
+    one fused multiply-add; the backward pass is the same recurrence run from the end.
+    """
+    return _recur(decay, inputs)
+
+
+@torch.library.custom_op(
+    "asysplat::linear_recurrence", mutates_args=(), schema="(Tensor decay, Tensor inputs) -> Tensor"
+)
+def _recur(decay, inputs):
+    decay, inputs = decay.contiguous(), inputs.contiguous()
+    states = torch.empty_like(inputs)
+    previous = torch.zeros_like(inputs[0])
+    for state, factor, new in zip(states, decay, inputs, strict=True):
+        previous = torch.addcmul(new, factor, previous, out=state)
+    return states
+
+
+@torch.library.custom_op(
+    "asysplat::linear_recurrence_backward",
+    mutates_args=(),
+    schema="(Tensor decay, Tensor states, Tensor grad_states) -> (Tensor, Tensor)",
+)
+def _recur_backward(decay, states, grad_states):
+    decay = decay.contiguous()
+    grad_inputs = grad_states.clone(memory_format=torch.contiguous_format)
+    for t in range(len(states) - 2, -1, -1):
+        grad_inputs[t].addcmul_(decay[t + 1], grad_inputs[t + 1])
+    grad_decay = torch.zeros_like(decay)
+    torch.mul(grad_inputs[1:], states[:-1], out=grad_decay[1:])
+    return grad_decay, grad_inputs
+
+
+@_recur.register_fake
+def _(decay, inputs):
+    return inputs.new_empty(inputs.shape)
+
+
+@_recur_backward.register_fake
+def _(decay, states, grad_states):
+    return decay.new_empty(decay.shape), states.new_empty(states.shape)
+
+
+def _save_states(ctx, inputs, output):
+    ctx.save_for_backward(inputs[0], output)
+
+
+def _recur_gradients(ctx, grad_states):
+    return _recur_backward(*ctx.saved_tensors, grad_states)
+
+
+_recur.register_autograd(_recur_gradients, setup_context=_save_states)
+
+
+@register_flop_formula(torch.ops.asysplat.linear_recurrence)
+def _recur_flops(decay_shape, inputs_shape, *_, **__) -> int:
+    return 2 * torch.Size(inputs_shape).numel()
+
+
+@register_flop_formula(torch.ops.asysplat.linear_recurrence_backward)
+def _recur_backward_flops(decay_shape, states_shape, *_, **__) -> int:
+    return 3 * torch.Size(states_shape).numel()

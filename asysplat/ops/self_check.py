@@ -109,11 +109,7 @@ def _compare(
     device: torch.device,
     backends: tuple[str, str],
 ) -> dict[str, float]:
-    """Compare the output and all gradients of an operator with those of its reference in float64.
-
-    `sample` draws the inputs from a function that draws normal numbers; `backends` names the
-    kernels and the reference.
-    """
+    """Compare an operator's output and all gradients with those of its reference in float64."""
     results = []
     for backend, dtype in zip(backends, (torch.float32, torch.float64), strict=True):
         draw = seeded_normal(device, dtype)

@@ -12,7 +12,6 @@ from asysplat.refinement.settings import (
     DEFAULT,
     PAPER,
     PUBLISHED_3DGS,
-    Rates,
     RefinementSettings,
     StepSchedule,
 )
@@ -23,7 +22,6 @@ __all__ = [
     "PUBLISHED_3DGS",
     "SCAFFOLD_GS",
     "AnchorScene",
-    "Rates",
     "Refinement",
     "RefinementProgress",
     "RefinementSettings",

@@ -67,16 +67,13 @@ class Fields:
         bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
         bands[0] = rates.sh
         bands[(sh_degree + 1) ** 2 :] = 0
-        by_name: dict[str, float | Tensor] = {
-            "offsets": rates.means,
-            "quats": rates.quats,
-            "log_scales": rates.scales,
-            "logits": rates.opacities,
-            "sh": bands,
-        }
+        of_others = 1 if means_alone else factor
         scaled = {
-            name: rate * (factor if name == "offsets" or not means_alone else 1)
-            for name, rate in by_name.items()
+            "offsets": rates.means * factor,
+            "quats": rates.quats * of_others,
+            "log_scales": rates.scales * of_others,
+            "logits": rates.opacities * of_others,
+            "sh": bands * of_others,
         }
         self.optimizer.step(gradients, scaled, visible)
         return visible

@@ -99,10 +99,7 @@ def without_invisible(gaussians: Gaussians) -> Gaussians:
 
 
 def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians:
-    """Place a faint isotropic Gaussian at each sparse point, as Kerbl et al. (2023).
-
-    It has the mean color of the point's pixels.
-    """
+    """Place a faint isotropic Gaussian at each point, of its mean color (Kerbl et al. 2023)."""
     if len(points) == 0 or not points.isfinite().all():
         raise InputError(
             f"gaussians_from_points got {len(points)} points with "

@@ -1,7 +1,4 @@
-"""Per-scene optimization of Gaussians, from a good initialization.
-
-The paper's post-optimization is the setting `PAPER`.
-"""
+"""Per-scene optimization of Gaussians; the paper's post-optimization is the setting `PAPER`."""
 
 import math
 import time
@@ -145,7 +142,9 @@ class Refinement:
 
     def densify(self, progress: float, number: int = 1) -> None:
         """Prune, add or relocate Gaussians, by the settings' method; `number` counts the rounds."""
-        self._densifier.densify(self._views(progress), self._next_count(number))
+        count, remaining_rounds = len(self.fields), self.settings.densify_rounds - number + 1
+        growth = (self._max_gaussians / count) ** (1 / max(1, remaining_rounds))
+        self._densifier.densify(self._views(progress), round(count * growth))
 
     def _make_densifier(self) -> Densifier:
         schedule, both = self.settings.every, (self.fields, self._generator)
@@ -161,10 +160,6 @@ class Refinement:
     def reset_opacities(self) -> None:
         """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
         self.fields.reset_opacities(MAX_RESET_OPACITY)
-
-    def _next_count(self, number: int) -> int:
-        count, remaining_rounds = len(self.fields), self.settings.densify_rounds - number + 1
-        return round(count * (self._max_gaussians / count) ** (1 / max(1, remaining_rounds)))
 
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float

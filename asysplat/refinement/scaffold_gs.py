@@ -1,7 +1,6 @@
 """Scaffold-GS: Gaussians that small networks derive from anchors, anew for each view.
 
-"Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering", Lu et al. 2024, with the
-constants of its code (city-super/Scaffold-GS, without appearance codes).
+Lu et al. 2024, with the constants of its code (city-super/Scaffold-GS), without appearance codes.
 """
 
 import sys

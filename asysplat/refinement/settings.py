@@ -1,7 +1,4 @@
-"""Settings of a refinement: learning rates, loss, schedule and densification.
-
-conf/refinement says what each is, and has its values.
-"""
+"""Settings of a refinement; conf/refinement says what each is, and has its values."""
 
 import math
 import sys

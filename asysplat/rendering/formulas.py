@@ -52,10 +52,7 @@ def apply_passes(
     masks: Bool[Tensor, "B V H W"] | None,
     centers: Float[Tensor, "B V N 2"] | None,
 ) -> RenderOutputs:
-    """Run a backend's forward passes as one operation of torch.
-
-    `centers` is not read: it receives the gradients of the splats' centers.
-    """
+    """Run a backend's passes as one operation of torch; `centers` receives gradients alone."""
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     poses = (cameras.cam_to_world, cameras.intrinsics)
     size = (cameras.height, cameras.width)

@@ -53,17 +53,14 @@ BLENDING_LIMITS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
 
 @dataclass(frozen=True)
 class Culling:
-    """Exact culling: work that can be left out without changing a bit of an image or a gradient.
-
-    `without_culling` switches kinds off.
-    """
+    """Exact culling: work that can be left out without changing a bit of an image or a gradient."""
 
     opacity: bool = True  # Gaussians below alpha_min, before the projection
     frustum: bool = True  # Gaussians outside the image, before their color is computed
     extent: bool = True  # of a splat beyond its own alpha_min, not only that of an opaque splat
     ellipse: bool = True  # tiles of a splat's box that its ellipse does not touch
     masks: bool = True  # tiles without a pixel that counts
-    rows: bool = True  # rows of a tile's pixels that a splat does not reach
+    rows: bool = True  # rows of a tile's pixels that a splat does not reach; on a CPU alone
     opaque: bool = True  # splats behind opaque rows and tiles
 
 

@@ -22,11 +22,7 @@ PAIR = ir.IntType(64)
 
 @intrinsic
 def gather_pairs(typing_context, image, y, x):
-    """Return both numbers at LANES points of a contiguous array [H, W, 2].
-
-    Args:
-        y, x: vectors of coordinates >= 0, which are rounded down.
-    """
+    """Return both numbers at LANES points y, x >= 0, rounded down, of a contiguous [H, W, 2]."""
 
     def generate(context, builder, signature, args):
         image = _Image(context, builder, signature, args)
@@ -40,12 +36,8 @@ def gather_pairs(typing_context, image, y, x):
 def gather_squares(typing_context, image, y, x):
     """Return the four numbers around LANES points of a contiguous array [H, W].
 
-    Args:
-        y, x: vectors of coordinates, from 0 to less than H - 1 and W - 1.
-
-    Returns:
-        Six vectors: the numbers above left, above right, below left and below right; and the
-        fractions of y and x, in [0, 1).
+    The points have 0 <= y < H - 1 and 0 <= x < W - 1. Six vectors are returned: the numbers above
+    left, above right, below left and below right; and the fractions of y and x, in [0, 1).
     """
 
     def generate(context, builder, signature, args):
@@ -82,10 +74,7 @@ class _Image:
     def pairs(self, index: ir.Value, kind: ir.Type) -> list[ir.Value]:
         """Return the numbers at LANES indices, and the numbers after them.
 
-        Both are read as one number of 64 bits.
-
-        Args:
-            index: vector of indices, which count numbers or, if `kind` is PAIR, pairs.
+        Both are read as one number of 64 bits. Indices count numbers or, if `kind` is PAIR, pairs.
         """
         builder = self.builder
         self._check(index, kind)

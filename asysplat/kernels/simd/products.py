@@ -32,11 +32,7 @@ BYTES = 4  # size of a float32
 def add_product(out, a, b, keep):
     """Compute out = keep out + a b; with `keep` = 0, NaN in `out` is overwritten too.
 
-    Args:
-        out: [rows, columns], contiguous along rows; the columns are a multiple of LANES.
-        a: [rows, terms], of any strides.
-        b: [terms, columns], contiguous along rows.
-        keep: factor of the previous values of `out`.
+    `out` and `b` are contiguous along rows, of a multiple of LANES numbers; `a` has any strides.
     """
     rows, terms = a.shape
     whole = rows // ROWS * ROWS
@@ -65,9 +61,7 @@ def add_triangle(out, a, b, upper):
 def transpose(matrix, out):
     """Write the transpose of `matrix` into the first columns of `out`.
 
-    Args:
-        matrix: [rows, columns], contiguous along rows; the columns are a multiple of LANES.
-        out: [columns, rows or more], contiguous along rows.
+    Both are contiguous along rows; the columns of `matrix` are a multiple of LANES.
     """
     rows, columns = matrix.shape
     whole = rows // LANES * LANES

@@ -104,11 +104,7 @@ def even_bounds(count: int) -> np.ndarray:
 
 
 def weighted_bounds(ends: np.ndarray) -> np.ndarray:
-    """Divide blocks into portions of about equal cost; return the bounds.
-
-    Args:
-        ends: cumulative costs of the blocks, [0, ..., total].
-    """
+    """Divide blocks of the cumulative costs [0, ..., total] evenly; return the bounds."""
     targets = np.linspace(ends[0], ends[-1], _portions() + 1)
     bounds = np.searchsorted(ends, targets)
     bounds[0], bounds[-1] = 0, len(ends) - 1

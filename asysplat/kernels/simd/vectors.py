@@ -81,10 +81,7 @@ def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir
 
 
 def check_range(context, builder, first, count, length) -> None:
-    """With NUMBA_BOUNDSCHECK=1, make the kernel raise IndexError for a range outside an array.
-
-    The range is the `count` elements from `first` on; the array has `length` elements.
-    """
+    """With NUMBA_BOUNDSCHECK=1, check that `count` elements from `first` on are within `length`."""
     if not numba.config.BOUNDSCHECK:
         return
     with builder.if_then(builder.icmp_signed(">", count, count.type(0))):
@@ -209,10 +206,7 @@ rsqrt = _unary(VECTOR, _emit_rsqrt)  # 1 / sqrt(x) of each number, to a relative
 
 
 def vector_at(context, builder, signature, args, step=LANES):
-    """Return a pointer to LANES elements of the contiguous array args[0].
-
-    The first is the element args[1] x `step`.
-    """
+    """Return a pointer to LANES elements of the array args[0], from args[1] x `step` on."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
     index = context.cast(builder, args[1], signature.args[1], types.intp)
     first = builder.mul(index, index.type(step))
@@ -317,8 +311,5 @@ def exp2(x):
 
 @inline
 def decay2(x):
-    """Compute 2^x for x <= 0, to a relative error of 8e-8 or an absolute one of 1e-38.
-
-    It is 0 from UNDERFLOW down.
-    """
+    """Compute 2^x for x <= 0, to a relative error of 8e-8 or an absolute one of 1e-38."""
     return exp2(max(x, UNDERFLOW))

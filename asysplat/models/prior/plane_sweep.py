@@ -15,13 +15,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
-from asysplat.models.prior.prior import (
-    DepthEstimate,
-    Prior,
-    count_votes,
-    fill_unknown,
-    other_views,
-)
+from asysplat.models.prior.prior import DepthEstimate, Prior, count_votes, fill_unknown, other_views
 from asysplat.models.prior.projections import (
     PairwiseProjections,
     choose_neighbors,

@@ -53,9 +53,8 @@ class Prior(TensorRecord):
         votes = depth.votes
         alone = (votes.containing == 0).to(depth.confidence)
         sure = _per_view_opacity(SURFACE_OPACITY, votes.agreeing).logit()
-        unsure = _per_view_opacity(
-            UNCERTAIN_SURFACE_OPACITY, votes.containing - votes.occluding
-        ).logit()
+        not_occluded = votes.containing - votes.occluding
+        unsure = _per_view_opacity(UNCERTAIN_SURFACE_OPACITY, not_occluded).logit()
         opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
         inverse, confidence, opacity = (
             F.interpolate(values, size, mode="bilinear")
@@ -107,10 +106,7 @@ def count_votes(
     projections: Float[Tensor, "B V K 3 4"],
     backend: str = "auto",
 ) -> Consistency:
-    """Count for each pixel's point the views that see it, that see through it, or that do not.
-
-    See `asysplat.ops.plane_sweep.reference.consistency`.
-    """
+    """Count the views that see each pixel's point, see through it, or do not; see `Consistency`."""
     consistency = load_backend(backend, inverse).consistency
     steps = torch.zeros_like(inverse[..., 0, 0])
     return consistency(inverse, steps, trust, others, projections, tolerance=VOTE_TOLERANCE)

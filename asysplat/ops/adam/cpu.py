@@ -90,10 +90,7 @@ def _constants(settings: AdamSettings) -> Constants:
 
 @kernel
 def update_blocks(start, stop, tensors, visible, constants):
-    """Update the rows of the blocks start to stop; return the number of visible rows not updated.
-
-    `tensors` is a tuple of `FlatRows`.
-    """
+    """Update the visible rows of blocks start to stop; return how many gradients are not finite."""
     alive = np.zeros(BLOCK, np.bool_)
     factors = np.zeros((1, BLOCK, 2), np.float32)
     dropped_rows = 0

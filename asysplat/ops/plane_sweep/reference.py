@@ -50,29 +50,6 @@ class CostInputs(NamedTuple):
     inverse: Tensor  # [n, planes rounded up to whole vectors] inverse depths
 
 
-def prepare_inputs(
-    images: Float[Tensor, "B V H W"],
-    neighbors: Int[Tensor, "B V K"],
-    projections: Float[Tensor, "B V K 3 4"],
-    ranges: Float[Tensor, "B V 2"],
-    planes: int,
-) -> CostInputs:
-    """Convert the inputs of `cost_volume` to those of its kernels."""
-    device = images.device
-    # The mean's square would hide the small variances of an image.
-    flat = (images - images.mean((-1, -2), keepdim=True)).flatten(0, 1)
-    first = torch.arange(len(images), device=device)[:, None, None] * images.shape[1]
-    steps = (ranges[..., 1:] - ranges[..., :1]) / (planes - 1)
-    indices = torch.arange(-(-planes // VECTOR) * VECTOR, device=device)
-    return CostInputs(
-        images=flat.contiguous(),
-        padded=F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0].contiguous(),
-        neighbors=torch.where(neighbors >= 0, neighbors + first, -1).flatten(0, 1).contiguous(),
-        projections=projections.flatten(0, 1).contiguous(),
-        inverse=(ranges[..., :1] + indices * steps).flatten(0, 1),
-    )
-
-
 def cost_volume(
     images: Float[Tensor, "B V H W"],
     neighbors: Int[Tensor, "B V K"],
@@ -267,3 +244,26 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "3 H 
         indexing="ij",
     )
     return torch.stack((x, y, torch.ones_like(x))).to(like)
+
+
+def prepare_inputs(
+    images: Float[Tensor, "B V H W"],
+    neighbors: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+    ranges: Float[Tensor, "B V 2"],
+    planes: int,
+) -> CostInputs:
+    """Convert the inputs of `cost_volume` to those of its kernels."""
+    device = images.device
+    # The mean's square would hide the small variances of an image.
+    flat = (images - images.mean((-1, -2), keepdim=True)).flatten(0, 1)
+    first = torch.arange(len(images), device=device)[:, None, None] * images.shape[1]
+    steps = (ranges[..., 1:] - ranges[..., :1]) / (planes - 1)
+    indices = torch.arange(-(-planes // VECTOR) * VECTOR, device=device)
+    return CostInputs(
+        images=flat.contiguous(),
+        padded=F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0].contiguous(),
+        neighbors=torch.where(neighbors >= 0, neighbors + first, -1).flatten(0, 1).contiguous(),
+        projections=projections.flatten(0, 1).contiguous(),
+        inverse=(ranges[..., :1] + indices * steps).flatten(0, 1),
+    )

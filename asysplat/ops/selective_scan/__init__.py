@@ -4,10 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.scan import Scan, ScanInputs
-from asysplat.ops.selective_scan.reference import (
-    selective_scan_chunked,
-    selective_scan_reference,
-)
+from asysplat.ops.selective_scan.reference import selective_scan_chunked, selective_scan_reference
 
 
 def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:

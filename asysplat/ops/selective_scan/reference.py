@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from asysplat.ops.recurrence import linear_recurrence
-from asysplat.ops.scan import ScanInputs
+from asysplat.ops.scan import ScanInputs, linear_recurrence
 
 CHECKPOINT_CHUNK = 256  # tokens whose states are in memory at once
 

@@ -6,8 +6,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.recurrence import linear_recurrence
-from asysplat.ops.scan import ScanInputs
+from asysplat.ops.scan import ScanInputs, linear_recurrence
 
 CHUNK = 64  # tokens of a chunk on every backend; the FLOP counts depend on it
 

@@ -1,7 +1,6 @@
 """Densification of 3DGS: clone and split Gaussians with large screen-space gradients.
 
-"3D Gaussian Splatting for Real-Time Radiance Field Rendering", Kerbl et al. 2023, Sec. 5.2, with
-the constants of its code.
+Kerbl et al. 2023, Sec. 5.2, with the constants of its code.
 """
 
 from dataclasses import replace
@@ -26,17 +25,14 @@ MAX_RESET_OPACITY = 0.01
 
 
 class CloneSplitDensifier(Densifier):
-    """Clones and splits by the gradients since the last round.
-
-    After `first_reset`, the step of the first opacity reset, large Gaussians are pruned.
-    """
+    """Clones and splits by the gradients since the last round."""
 
     def __init__(
         self,
         fields: Fields,
         generator: torch.Generator,
         max_gaussians: int,
-        first_reset: int | None,
+        first_reset: int | None,  # step of the first opacity reset; then large ones are pruned
     ):
         self.generator, self.max_gaussians, self.first_reset = generator, max_gaussians, first_reset
         self._gradients, self._steps = ScreenGradients(fields), 0

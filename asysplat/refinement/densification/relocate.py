@@ -1,7 +1,4 @@
-"""Densification of 3DGS-MCMC: relocate dead Gaussians to live ones.
-
-"3D Gaussian Splatting as Markov Chain Monte Carlo", Kheradmand et al. 2024.
-"""
+"""Densification of 3DGS-MCMC (Kheradmand et al. 2024): relocate dead Gaussians to live ones."""
 
 from dataclasses import replace
 

@@ -21,17 +21,14 @@ VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 
 
 class ErrorDensifier(Densifier):
-    """Prunes faint and unseen Gaussians, and spawns others at pixels with a large error.
-
-    `units` computes the unit of the offsets at positions, see `Fields`.
-    """
+    """Prunes faint and unseen Gaussians, and spawns others at pixels with a large error."""
 
     def __init__(
         self,
         fields: Fields,
         generator: torch.Generator,
         background: Float[Tensor, "3"],
-        units: Callable[[Tensor], Tensor],
+        units: Callable[[Tensor], Tensor],  # of the offsets at positions, see `Fields`
     ):
         self.fields, self.generator, self.background = fields, generator, background
         self.units, self._steps = units, 0

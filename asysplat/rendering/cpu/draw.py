@@ -11,39 +11,16 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
 from asysplat.kernels.simd.threads import even_bounds, run_blocks, weighted_bounds
+from asysplat.rendering import formulas
 from asysplat.rendering.cpu import project as projection
 from asysplat.rendering.cpu import rasterize as raster
+from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.project import Projected, project
 from asysplat.rendering.cpu.project_backward import LOG_2, project_backward
-from asysplat.rendering.cpu.rasterize import (
-    BlendedDepth,
-    Gradients,
-    MedianDepth,
-    OutputImages,
-    SavedForBackward,
-    rasterize,
-    rasterize_backward,
-)
-from asysplat.rendering.cpu.splat import (
-    G_X,
-    G_Y,
-    GRADIENT,
-    SPLAT,
-    TILE,
-    Frame,
-    ProjectSettings,
-    RasterSettings,
-)
+from asysplat.rendering.cpu.rasterize import BlendedDepth, MedianDepth, SavedForBackward
+from asysplat.rendering.cpu.splat import SPLAT, TILE, Frame, ProjectSettings, RasterSettings
 from asysplat.rendering.cpu.tiles import TileLists, scatter_pairs, start_positions
-from asysplat.rendering.formulas import (
-    CAMERA_GRADIENT,
-    KernelInputs,
-    active_tiles,
-    apply_passes,
-    camera_gradients,
-    camera_rows,
-    image_gradients,
-)
+from asysplat.rendering.formulas import KernelInputs
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
@@ -59,11 +36,7 @@ def draw(
     masks: Bool[Tensor, "B V H W"] | None = None,
     centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
-    """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
-
-    The values of pixels where `masks` is False are arbitrary. `centers` receives the gradients of
-    the centers.
-    """
+    """Draw as `reference.draw`, in float32; pixels where `masks` is False are arbitrary."""
     if gaussians.means.device.type != "cpu":
         raise InputError(
             f"render's backend is 'cpu' and its Gaussians are on {gaussians.means.device}: choose "
@@ -72,7 +45,7 @@ def draw(
     images = math.prod(cameras.intrinsics.shape[:2])
     if images * gaussians.num_gaussians > MAX_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
-    return apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
+    return formulas.apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
 
 
 class _Passes(torch.autograd.Function):
@@ -98,18 +71,18 @@ class _Passes(torch.autograd.Function):
     def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
         *tensors, transmittance = ctx.saved_tensors
         frame, lists = ctx.frame, ctx.lists
-        grad_image, grad_transmittance = image_gradients(
+        grad_image, grad_transmittance = formulas.image_gradients(
             grad_image, grad_alpha, grad_transmittance, transmittance
         )
-        grads = Gradients(
+        grads = raster.Gradients(
             image=grad_image.numpy(),
             transmittance=grad_transmittance.numpy(),
-            pairs=np.empty((len(lists.entries), GRADIENT), np.float32),
+            pairs=np.empty((len(lists.entries), col.GRADIENT), np.float32),
         )
         saved = SavedForBackward(transmittance.numpy(), *ctx.saved)
         depths = _depths(ctx.settings.depth, grad_depth, ctx.auxiliary)
         tiles = weighted_bounds(lists.first_entry)
-        run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
+        run_blocks(raster.rasterize_backward, tiles, lists, frame, saved, grads, *depths)
         inputs = _inputs(tensors, ctx.size, ctx.settings)
         needs = (ctx.needs_input_grad[9], any(ctx.needs_input_grad[10:]))
         pairs = (lists.first_pair, grads.pairs)
@@ -162,7 +135,7 @@ def _inputs(
     tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
 ) -> KernelInputs:
     *fields, cam_to_world, intrinsics = tensors
-    cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
+    cameras = formulas.camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return KernelInputs(*(_array(field) for field in fields), cameras=cameras.numpy())
 
 
@@ -193,7 +166,7 @@ def _list_tiles(
     check_pairs(pairs, int(lengths.max()))
     active = np.ones(len(lengths), np.bool_)
     if masks is not None:
-        active = active_tiles(masks, TILE).numpy()
+        active = formulas.active_tiles(masks, TILE).numpy()
     lists = TileLists(
         splats=projected.splats,
         first_pair=_starts(projected.counts),
@@ -219,11 +192,7 @@ def _list_tiles(
 def _rasterize(
     frame: Frame, lists: TileLists, depth: str | None, stats: dict[str, int]
 ) -> tuple[tuple[Tensor | None, ...], SavedForBackward, np.ndarray | None]:
-    """Draw image, alpha, transmittance, depth and its origins.
-
-    Also return what the backward pass needs: `SavedForBackward` and the other array of the depth,
-    see `_depths`.
-    """
+    """Draw image, alpha, transmittance, depth and its origins; also what backward needs."""
     image = torch.empty(frame.images, 3, frame.height, frame.width)
     alpha = torch.empty(frame.images, frame.height, frame.width)
     transmittance = torch.empty_like(alpha)
@@ -238,10 +207,10 @@ def _rasterize(
         last_entry=np.empty(frame.images * frame.tiles, np.int64),
         counters=np.empty((frame.images * frame.tiles, raster.COUNTERS), np.int64),
     )
-    images = OutputImages(image.numpy(), alpha.numpy())
+    images = raster.OutputImages(image.numpy(), alpha.numpy())
     depths = _depths(depth, drawn_depth, auxiliary)
     tiles = weighted_bounds(lists.first_entry)
-    run_blocks(rasterize, tiles, lists, frame, images, saved, *depths)
+    run_blocks(raster.rasterize, tiles, lists, frame, images, saved, *depths)
     rows, in_extent = saved.counters.sum(0).tolist()
     drawn = int((saved.last_entry - lists.first_entry[:-1]).sum())
     stats["pairs_culled_by_opaque"] = stats["pairs"] - stats["pairs_culled_by_masks"] - drawn
@@ -262,7 +231,7 @@ def _project_backward(
     *fields, cam_to_world, intrinsics = tensors
     field_grads = [_empty_like(field) for field in fields[:4]]
     field_grads.append(_empty_like(fields[4] if needs[0] else fields[4][:0]))
-    camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
+    camera_grads = np.empty((frame.images, frame.blocks, formulas.CAMERA_GRADIENT))
     grads = KernelInputs(*(_array(grad) for grad in field_grads), cameras=camera_grads)
     flat = inputs._replace(quats=inputs.quats.reshape(-1), scales=inputs.scales.reshape(-1))
     blocks = even_bounds(frame.images // frame.views * frame.blocks)
@@ -271,7 +240,7 @@ def _project_backward(
     poses = (None, None)
     if needs[1]:
         rows = torch.from_numpy(camera_grads.sum(1))
-        poses = camera_gradients(rows, cam_to_world, intrinsics)
+        poses = formulas.camera_gradients(rows, cam_to_world, intrinsics)
     return (*others, sh if needs[0] else None, *poses)
 
 
@@ -281,7 +250,7 @@ def _center_gradients(
     counts = torch.from_numpy(first_pair).diff()
     owners = torch.arange(len(counts)).repeat_interleave(counts)
     sums = torch.zeros(len(counts), 2, dtype=torch.float64)
-    sums.index_add_(0, owners, LOG_2 * torch.from_numpy(pair_grads[:, [G_X, G_Y]]).double())
+    sums.index_add_(0, owners, LOG_2 * torch.from_numpy(pair_grads[:, [col.G_X, col.G_Y]]).double())
     return sums.float().view(-1, frame.views, frame.num, 2)
 
 

@@ -1,7 +1,4 @@
-"""Arithmetic of the renderer's kernels: cameras, ellipses, spherical harmonics (SH), bits.
-
-Both projection passes share it; all of it is in float64.
-"""
+"""Arithmetic of both projection passes, in float64: cameras, ellipses, spherical harmonics (SH)."""
 
 import math
 
@@ -70,12 +67,6 @@ def load_camera(cameras, image):
     limits_x = (row[formulas.LOW_X], row[formulas.HIGH_X])
     limits_y = (row[formulas.LOW_Y], row[formulas.HIGH_Y])
     return axes, triple(row, formulas.CENTER), focal, (limits_x, limits_y), principal
-
-
-@inline
-def compensation(det0, det, floor):
-    """Compute the factor of the opacity for antialiasing (Yu et al. 2024, Mip-Splatting)."""
-    return math.sqrt(max(det0 / det, floor))
 
 
 @intrinsic

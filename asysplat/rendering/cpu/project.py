@@ -12,7 +12,6 @@ import numpy as np
 from asysplat.geometry.spherical_harmonics import MIN_SQUARED_DISTANCE
 from asysplat.kernels.simd.threads import inline, kernel
 from asysplat.rendering.cpu.math import (
-    compensation,
     covariance,
     dot,
     ellipse_rows,
@@ -168,7 +167,8 @@ def _project_batch(count, batch, camera, frame, ellipses):
         a, b, c = whitening(xy, yy + eps, det)
         opacity = np.float64(opacities[i])
         if settings.antialiased:
-            opacity *= compensation(det0, det, settings.compensation_min)
+            # Yu et al. 2024, Mip-Splatting
+            opacity *= math.sqrt(max(det0 / det, settings.compensation_min))
         x = tangents[0] * focal[0] + principal[0]
         y = tangents[1] * focal[1] + principal[1]
         log_opacity = log2(opacity)

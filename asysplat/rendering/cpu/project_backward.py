@@ -6,6 +6,7 @@ import numpy as np
 
 from asysplat.geometry.spherical_harmonics import MIN_SQUARED_DISTANCE
 from asysplat.kernels.simd.threads import inline, kernel
+from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.math import (
     covariance,
     covariance_gradient,
@@ -22,17 +23,6 @@ from asysplat.rendering.cpu.math import (
     unit_quaternion,
     whitening,
     write_sh_basis,
-)
-from asysplat.rendering.cpu.splat import (
-    G_A,
-    G_B,
-    G_C,
-    G_DEPTH,
-    G_LOG_OPACITY,
-    G_RED,
-    G_X,
-    G_Y,
-    GRADIENT,
 )
 from asysplat.rendering.formulas import CENTER, CX, CY, DOWN, FORWARD, FX, FY, RIGHT, WHITEN_TO_LOG2
 
@@ -52,7 +42,7 @@ def project_backward(start, stop, inputs, frame, first_pair, pair_grads, needs, 
     """
     blocks, num = frame.blocks, frame.num
     count = inputs.sh.shape[1]
-    splat_grads = np.empty(GRADIENT)
+    splat_grads = np.empty(col.GRADIENT)
     grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_cameras = grads
     sums, basis, g_basis = np.empty(SUMS), np.empty(16), np.empty(16)
     scratch = (sums, basis, g_basis)
@@ -71,7 +61,7 @@ def project_backward(start, stop, inputs, frame, first_pair, pair_grads, needs, 
                     continue
                 _clear(splat_grads)
                 for pair in range(first_pair[d], first_pair[d + 1]):
-                    for k in range(GRADIENT):
+                    for k in range(col.GRADIENT):
                         splat_grads[k] += pair_grads[pair, k]
                 g_camera = grad_cameras[image, block]
                 g_opacity += _add_splat(
@@ -122,14 +112,18 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     # Opacity, and antialiasing.
     opacity = np.float64(inputs.opacities[g])
     g_det0 = g_det = 0.0
-    g_opacity = splat_grads[G_LOG_OPACITY] / opacity
+    g_opacity = splat_grads[col.G_LOG_OPACITY] / opacity
     if settings.antialiased and det0 > settings.compensation_min * det:
-        half = 0.5 * splat_grads[G_LOG_OPACITY]  # log compensation = (log det0 - log det) / 2
+        half = 0.5 * splat_grads[col.G_LOG_OPACITY]  # log compensation = (log det0 - log det) / 2
         g_det0, g_det = half / det0, -half / det
 
     # Whitening, covariance, scale and rotation.
     factor = LOG_2 * WHITEN_TO_LOG2
-    g_abc = (factor * splat_grads[G_A], factor * splat_grads[G_B], factor * splat_grads[G_C])
+    g_abc = (
+        factor * splat_grads[col.G_A],
+        factor * splat_grads[col.G_B],
+        factor * splat_grads[col.G_C],
+    )
     abc = whitening(xy, yy + eps, det)
     g_mx, g_my = covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps)
     g_scale, g_quat, g_row_x, g_row_y = ellipse_rows_gradient(g_mx, g_my, quat, scale, row_x, row_y)
@@ -138,7 +132,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
         sums[QUAT + k] += g_quat[k]
 
     # The Jacobian's rows, and center and depth.
-    g_xyz = (LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y], splat_grads[G_DEPTH])
+    g_xyz = (LOG_2 * splat_grads[col.G_X], LOG_2 * splat_grads[col.G_Y], splat_grads[col.G_DEPTH])
     projected = (offset, inverse_z, tangents, clamped)
     g_offset, g_axes, g_focal, g_principal = project_mean_gradient(
         g_xyz, (g_row_x, g_row_y), (row_x, row_y), projected, axes, focal
@@ -157,7 +151,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
         for k in range(count):
             color += basis[k] * np.float64(sh[g, k, channel])
         if color > 0:
-            g_color = splat_grads[G_RED + channel]
+            g_color = splat_grads[col.G_RED + channel]
             for k in range(count):
                 if needs[0]:
                     sums[SH + 3 * k + channel] += basis[k] * g_color

@@ -187,10 +187,7 @@ def load_splat(splats, bases, d, window):
 
 @inline
 def visible_rows(splats, d, y, rows):
-    """Compute the first and the last of a tile's rows that splat d can reach.
-
-    y leads from the splat's center to the first row, as in `TileSplat`.
-    """
+    """Compute the first and the last of a tile's rows that splat d can reach; see `TileSplat.y`."""
     extent = np.float64(splats[d, EXTENT_Y]) + PIXEL_MARGIN
     first = math.ceil(max(-y - extent, 0.0))
     last = math.floor(min(-y + extent, rows - 1.0))

@@ -44,10 +44,7 @@ def tile_range(center, start, stop, size):
 
 @inline
 def compute_box(ellipse, extent_x, frame, box):
-    """Write the first and last row and column of tiles that an ellipse's box touches.
-
-    Return the number of these tiles.
-    """
+    """Write the first and last row and column of tiles in an ellipse's box; return their number."""
     x, y, extent_y = ellipse.x, ellipse.y, ellipse.extent_y
     box[0], box[1] = tile_range(y, -extent_y, extent_y, frame.height)
     box[2], box[3] = tile_range(x, -extent_x, extent_x, frame.width)
@@ -77,10 +74,7 @@ def row_span(ellipse, row, frame):
 
 @inline
 def list_tiles(ellipse, box, frame, histogram, tiles, start):
-    """Write the tiles of a splat from tiles[start] on, row by row, and count them in the histogram.
-
-    Return their number, at most that of its box.
-    """
+    """Write a splat's tiles to tiles[start:], count them in the histogram; return their number."""
     first_row, last_row, left, right = box[0], box[1], box[2], box[3]
     # The ellipse touches every tile of a box of one row or one column; an extent may be cut short.
     exact = frame.project.cull_ellipse and right > left and last_row > first_row

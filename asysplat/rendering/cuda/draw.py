@@ -10,20 +10,13 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
 from asysplat.kernels.triton_utils import INTERPRETED
+from asysplat.rendering import formulas
 from asysplat.rendering.cuda.project import COUNTERS, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
 from asysplat.rendering.cuda.rasterize import SavedForBackward, rasterize, rasterize_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
 from asysplat.rendering.cuda.tiles import TileLists, list_tiles
-from asysplat.rendering.formulas import (
-    CAMERA_GRADIENT,
-    KernelInputs,
-    active_tiles,
-    apply_passes,
-    camera_gradients,
-    camera_rows,
-    image_gradients,
-)
+from asysplat.rendering.formulas import KernelInputs
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs, check_splats
 from asysplat.scene import Cameras, Gaussians
 
@@ -44,18 +37,14 @@ def draw(
     masks: Bool[Tensor, "B V H W"] | None = None,
     centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
-    """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
-
-    The values of pixels where `masks` is False are arbitrary. `centers` receives the gradients of
-    the centers. Uses all of `settings.culling` but rows.
-    """
+    """Draw as `reference.draw`, in float32; pixels where `masks` is False are arbitrary."""
     if not (gaussians.means.is_cuda or INTERPRETED):
         raise InputError(
             f"render's backend is 'cuda' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cuda')."
         )
     check_splats(math.prod(cameras.intrinsics.shape[:2]), gaussians.num_gaussians)
-    return apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
+    return formulas.apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
 
 
 class _Passes(torch.autograd.Function):
@@ -84,7 +73,7 @@ class _Passes(torch.autograd.Function):
         count = len(TileLists._fields)
         lists, saved = TileLists(*rest[:count]), SavedForBackward(*rest[count:])
         frame, settings = ctx.frame, ctx.settings
-        grad_image, grad_transmittance = image_gradients(
+        grad_image, grad_transmittance = formulas.image_gradients(
             grad_image, grad_alpha, grad_transmittance, saved.transmittance
         )
         if grad_depth is None and settings.depth is not None:
@@ -119,7 +108,7 @@ class _Passes(torch.autograd.Function):
             centers = _center_gradients(frame, lists, pair_grads)
         poses = (None, None)
         if grads.cameras is not None:
-            poses = camera_gradients(grads.cameras.sum(1), *tensors[5:])
+            poses = formulas.camera_gradients(grads.cameras.sum(1), *tensors[5:])
         fields = zip(grads[:5], tensors[:5], strict=True)
         fields = (None if grad is None else grad.view(field.shape) for grad, field in fields)
         return (None,) * 4 + (centers, *fields, *poses)
@@ -147,7 +136,7 @@ def _inputs(
     tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
 ) -> KernelInputs:
     *fields, cam_to_world, intrinsics = tensors
-    cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
+    cameras = formulas.camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return KernelInputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
@@ -232,7 +221,7 @@ def _list_tiles(
         first_entry=torch.searchsorted(tile_of, starts),
         entries=owners[numbers],
         pairs=numbers,
-        active=None if masks is None else active_tiles(masks, TILE.value),
+        active=None if masks is None else formulas.active_tiles(masks, TILE.value),
     )
     return lists, box_tiles.sum()
 
@@ -309,7 +298,7 @@ def _project_backward(
     """Compute the gradients of the inputs from those of the pairs; None where not required."""
     has_depth = settings.depth is not None
     blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
-    shape = (frame.images, blocks, CAMERA_GRADIENT)
+    shape = (frame.images, blocks, formulas.CAMERA_GRADIENT)
     sh = torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None
     cameras = None
     if needs["CAMERAS_NEEDED"]:

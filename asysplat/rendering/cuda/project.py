@@ -37,9 +37,9 @@ def project(
     opacities,
     sh,
     cameras,
-    splats,
-    depths,
-    counters,
+    splats,  # written, like the next two
+    depths,  # [images * num], 0 where culled
+    counters,  # [programs, COUNTERS]
     num,
     views,
     height,
@@ -56,10 +56,7 @@ def project(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Compute the splats of BLOCK Gaussians in one image; see `cpu.project.project`.
-
-    splats, depths [images * num], 0 where culled, and counters [programs, COUNTERS] are written.
-    """
+    """Compute the splats of BLOCK Gaussians in one image; see `cpu.project.project`."""
     image = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     g = image // views * num + n

@@ -85,13 +85,13 @@ def project_backward(
     cameras,
     counts,
     first_pair,
-    grads,
+    grads,  # [pairs, 10] from `sum_pairs`
     grad_means,
     grad_quats,
     grad_scales,
     grad_opacities,
-    grad_sh,
-    grad_cameras,
+    grad_sh,  # zeros to add to; None without SH_NEEDED
+    grad_cameras,  # [B * views, programs of a scene, 16] zeros; None without CAMERAS_NEEDED
     num,
     views,
     eps2d,
@@ -103,12 +103,7 @@ def project_backward(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Compute the gradients of BLOCK Gaussians of a scene: the sum over its views, in order.
-
-    grads [pairs, 10] come from `sum_pairs`; grad_sh holds zeros to add to, None without SH_NEEDED;
-    grad_cameras [B * views, programs of a scene, 16] the part of each program, from zeros, None
-    without CAMERAS_NEEDED.
-    """
+    """Compute the gradients of BLOCK Gaussians of a scene: the sum over its views, in order."""
     scene = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid = n < num

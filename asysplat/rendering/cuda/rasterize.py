@@ -54,14 +54,14 @@ def rasterize(
     entries,
     first_entry,
     last_entry,
-    active,
+    active,  # read with MASKED
     image,
     alpha,
     transmittance,
-    depth,
-    origins,
+    depth,  # written with DEPTH or MEDIAN
+    origins,  # written with DEPTH
     stop_ranks,
-    median_ranks,
+    median_ranks,  # written with MEDIAN
     columns,
     tiles,
     height,
@@ -73,13 +73,9 @@ def rasterize(
     DEPTH: tl.constexpr,
     MEDIAN: tl.constexpr,
     CULL_OPAQUE: tl.constexpr,
-    STEP: tl.constexpr,
+    STEP: tl.constexpr,  # splats between two checks whether all pixels are opaque
 ):
-    """Draw a tile; every pixel is written. See `cpu.rasterize`.
-
-    depth is written with DEPTH or MEDIAN, origins with DEPTH, median_ranks with MEDIAN; active is
-    read with MASKED. STEP splats lie between two checks whether all pixels are opaque.
-    """
+    """Draw a tile; every pixel is written. See `cpu.rasterize`."""
     tile = tl.program_id(0).to(tl.int64)
     image_index, left, top, lane_x, lane_y, pixel, inside = tile_window(
         tile, columns, tiles, height, width

@@ -39,7 +39,7 @@ def list_tiles(
     counts,  # [images * N] tiles of each splat
     box_tiles,  # [programs]
     ends,  # [num_visible] 1 + the index of a splat's last pair
-    tile_of,  # [pairs]
+    tile_of,  # [pairs] tile of each pair
     owners,  # [pairs] splat of each pair
     first_pair,  # [images * N]
     num_visible,
@@ -52,10 +52,7 @@ def list_tiles(
     CULL_ELLIPSE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Visit the tiles of BLOCK splats.
-
-    Without WRITE, write counts and box_tiles; with WRITE, write tile_of, owners and first_pair.
-    """
+    """Count the tiles of BLOCK splats, and of their boxes; with WRITE, list these pairs instead."""
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = rank < num_visible
     d = tl.load(order + rank, mask=valid, other=0)

@@ -53,10 +53,9 @@ def project(
 ) -> Splats:
     """Project Gaussians [B, N] to views [B, V] of zero skew; image b * V + v is view v of scene b.
 
-    `centers` receives the gradients of the centers.
-
-    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within the extent,
-    and Gaussians that do not project to finite numbers (NaN, infinity, a zero quaternion).
+    `centers` receives the gradients of the centers. Culled, with gradient 0: depth <= near, opacity
+    < alpha_min, no pixel center within the extent, and Gaussians that do not project to finite
+    numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
     images, indices = select_visible(gaussians, cameras, settings)

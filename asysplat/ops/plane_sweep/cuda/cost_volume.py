@@ -131,10 +131,7 @@ def cost_band(
 
 @kernel
 def add_row(line, neighbor_image, matrix, x, row, depth, height, width):
-    """Return the sums along a patch's row of a neighbor, its square, and its product with `line`.
-
-    The border is repeated beyond the image.
-    """
+    """Return the sums along a patch's row of a neighbor, its square and its product with `line`."""
     factors = factors_at(matrix, row)
     a, b, c = 0.0, 0.0, 0.0
     for k in tl.static_range(-RADIUS, RADIUS + 1):

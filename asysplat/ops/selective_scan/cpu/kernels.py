@@ -106,10 +106,7 @@ def forward_blocks(start, stop, inputs, y, saved_state):
 
 @kernel
 def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
-    """Write the gradients of the blocks start to stop, counted as in `forward_blocks`.
-
-    A task takes its blocks through a sequence, last chunk first.
-    """
+    """Write the gradients of the same blocks as `forward_blocks`, last chunk first."""
     x, dt, A, B, C, D, reverse = inputs
     grad_x, grad_dt, grad_A, grad_B, grad_C, grad_D = grads
     length, channels = x.shape[1:]

@@ -9,10 +9,7 @@ AHEAD = tl.constexpr(8)  # chunks that a program loads at once
 
 @kernel
 def locate(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
-    """Return sequence, chunk of the segment, channels, which exist, their states' places in [D, N].
-
-    Shapes: scalars, [BLOCK], [BLOCK], [BLOCK, STATE].
-    """
+    """Return sequence, chunk of the segment, channels, which exist, states' places in [D, N]."""
     chunk = tl.program_id(0)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(2).to(tl.int64)

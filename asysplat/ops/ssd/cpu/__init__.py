@@ -109,10 +109,7 @@ def _iterate_segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]
 
 
 def _make_segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Segment:
-    """Return a segment of one sequence, padded to whole chunks.
-
-    Padding has dt = 0: it neither decays the state nor adds to it.
-    """
+    """Return a segment of one sequence, padded to whole chunks with dt = 0: no state changes."""
     x, dt, B, C = (
         _pad_to_chunks(tensor[batch, tokens])
         for tensor in (inputs.x, inputs.dt, inputs.B, inputs.C)

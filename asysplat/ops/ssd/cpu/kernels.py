@@ -97,10 +97,7 @@ def weigh_scores(scores, high, low, reverse, weights):
 
 @inline
 def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores, grad_logs):
-    """Add the gradient of `weigh_scores` to `grad_scores`, and write that of each token's dt A.
-
-    The latter, `grad_logs`, is float64.
-    """
+    """Differentiate `weigh_scores`: add to `grad_scores`, write `grad_logs`, that of dt A."""
     size = len(scores)
     grads = np.empty(LANES, np.float32)
     column = np.zeros(size)
@@ -158,13 +155,10 @@ class HeadGradients(NamedTuple):
 
 
 class GroupGradients(NamedTuple):
-    """The gradients of the shared inputs, summed over each group of heads; float32, written.
+    """The gradients of the shared inputs, summed over each group of heads; float32, written."""
 
-    Those of B and C lack the part through the scores.
-    """
-
-    B: np.ndarray  # [c, groups, q, N in whole vectors]
-    C: np.ndarray  # [c, groups, q, N in whole vectors]
+    B: np.ndarray  # [c, groups, q, N in whole vectors], without the part through the scores
+    C: np.ndarray  # likewise
     scores: np.ndarray  # [c, groups, q, q]
 
 

@@ -45,14 +45,7 @@ def square_at(batch, chunk, chunks, CHUNK):
 
 @kernel
 def sum_decays(
-    dt,
-    A,
-    decays,
-    length,
-    heads,
-    REVERSE: tl.constexpr,
-    CHUNK: tl.constexpr,
-    HEADS: tl.constexpr,
+    dt, A, decays, length, heads, REVERSE: tl.constexpr, CHUNK: tl.constexpr, HEADS: tl.constexpr
 ):
     """Write the decays for a chunk and HEADS heads; a position without a token has dt = 0."""
     chunk = tl.program_id(0)
@@ -349,10 +342,7 @@ def projection_gradients(
     DOT: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """Write BLOCK columns of the gradient of B or C, [B, L, N], for a chunk's tokens.
-
-    The heads are summed in their order.
-    """
+    """Write BLOCK columns of the gradient of B or C, [B, L, N]; heads are summed in their order."""
     first, chunk = tl.program_id(0) * BLOCK, tl.program_id(1)
     batch = tl.program_id(2).to(tl.int64)
     lane = tl.arange(0, CHUNK)
