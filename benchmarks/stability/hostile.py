@@ -1,4 +1,4 @@
-"""Hostile images, cameras and Gaussians, for the suite and for tests/stress."""
+"""Hostile images, cameras and Gaussians, for the suite."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
