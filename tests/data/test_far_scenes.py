@@ -33,8 +33,8 @@ def network_poses(scene):
     return normalize(views, views)[0].cameras.cam_to_world
 
 
-@pytest.mark.parametrize("offset", [(5e5, 5.4e6, 300.0), (0, -2e7, 0), (1e4, 0, 0)])
-def test_a_geo_referenced_scene_is_the_same_to_the_network(offset):
+def test_a_geo_referenced_scene_is_the_same_to_the_network():
+    offset = (5e5, 5.4e6, 300.0)
     expected, found = network_poses(scene_at((0, 0, 0))), network_poses(scene_at(offset))
     assert (found - expected).abs().max() < 2e-6
     moved = FileSequence(scene_at(offset), OPTIONS).scene

@@ -7,7 +7,6 @@ import torch
 
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.procedural.geometry import Boxes, Cone, Spheres, Terrain
-from asysplat.data.procedural.path import hand_held_path
 from asysplat.data.sequence import ImageSequence
 from asysplat.errors import InputError
 
@@ -196,16 +195,3 @@ def test_cameras_move_smoothly_and_keep_clear(seed, varied):
         assert 1.5 < torch.cdist(cameras.centers, cameras.centers).max() < 5.5
     views = scene(seed, varied).views(range(0, 96, 6)).validate()
     assert views.depths.min() > 0.3
-
-
-def test_hand_held_paths_are_level_and_look_inward():
-    poses = hand_held_path(np.random.default_rng(0), 50, 2.0)
-    rotations = poses[:, :3, :3]
-    np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
-    )
-    # Image "down" points down in the world, and the roll is slight.
-    assert (rotations[:, 2, 1] < -0.8).all()
-    assert np.abs(rotations[:, 2, 0]).max() < 0.05
-    inward = -poses[:, :2, 3] / np.linalg.norm(poses[:, :2, 3], axis=1, keepdims=True)
-    assert (np.sum(inward * rotations[:, :2, 2], axis=1) > 0.7).all()

@@ -70,13 +70,8 @@ def test_training_stays_in_its_window_shares_no_image_and_is_repeated_by_its_see
 def test_too_short_a_sequence_or_window_is_refused():
     with pytest.raises(InputError, match=r"has 6 images.*data\.inputs and data\.targets.*6"):
         uniform_selection(6, num_inputs=4, num_targets=3)
-    with pytest.raises(InputError, match="has 24 images"):
-        uniform_selection(24, num_inputs=30, num_targets=2)
-    for count, window in ((6, (8, 9)), (50, (6, 20)), (50, (20, 10))):
-        with pytest.raises(InputError, match="has 6 images" if count == 6 else r"data\.window"):
-            training_selection(count, 4, 3, window, np.random.default_rng(0))
-    with pytest.raises(InputError, match=r"data\.inputs is 0"):
-        uniform_selection(9, num_inputs=0, num_targets=3)
+    with pytest.raises(InputError, match=r"data\.window"):
+        training_selection(50, 4, 3, (6, 20), np.random.default_rng(0))
 
 
 def test_targets_of_training_may_be_inputs_where_allowed():
@@ -251,8 +246,6 @@ def test_long_lrm_s_lists_give_inputs_and_every_8th_target(tmp_path):
     assert index == {"a": expected, "b": expected}
     assert read_index(tmp_path / "a/opencv_cameras.json", 2) == {"a": expected}
     assert select_from_index(index, tmp_path, "a", 20, 2) == Selection([3, 12], [0, 8, 16])
-    with pytest.raises(InputError, match=r"no list fold_8_kmeans_4_input .*fold_8_kmeans_2_input"):
-        read_index(tmp_path, 4)
 
 
 def test_long_lrm_s_published_file_is_read(tmp_path):
@@ -266,8 +259,6 @@ def test_long_lrm_s_published_file_is_read(tmp_path):
     file.write_text(json.dumps(scenes))
     index = read_index(file, 2)
     assert select_from_index(index, file, "0569", 18, 2) == Selection([5, 17], [0, 8, 16])
-    with pytest.raises(InputError, match="scene 0569 names image 17, and the scene has 17 images"):
-        select_from_index(index, file, "0569", 17, 2)
     with pytest.raises(InputError, match="scene 0569 has no list fold_8_kmeans_3_input"):
         read_index(file, 3)
 
@@ -282,14 +273,9 @@ def test_an_index_is_written_once(tmp_path):
 
 
 def test_an_unusable_index_is_named(tmp_path):
-    for text, message in (
-        ('{"a": {"context": [1]}}', "scene a, target is None"),
-        ('{"a": {"context": [1, 1], "target": [2]}}', "different image numbers"),
-        ("{", "is not JSON"),
-    ):
-        (tmp_path / "index.json").write_text(text)
-        with pytest.raises(InputError, match=rf"index\.json.*{message}"):
-            read_index(tmp_path / "index.json", 2)
+    (tmp_path / "index.json").write_text('{"a": {"context": [1, 1], "target": [2]}}')
+    with pytest.raises(InputError, match=r"index\.json.*different image numbers"):
+        read_index(tmp_path / "index.json", 2)
 
 
 @pytest.mark.medium

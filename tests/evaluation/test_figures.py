@@ -7,7 +7,6 @@ import torch
 from asysplat import Cameras, Views
 from asysplat.evaluation.figures import comparison_figure, learning_curve
 from asysplat.rendering import Rendering
-from asysplat.scene import inverse_depths
 
 
 def scene(depths=True):
@@ -16,11 +15,6 @@ def scene(depths=True):
     images = torch.rand(2, 3, 16, 16)
     views = Views(cameras, images, torch.ones(2, 16, 16) if depths else None)
     return views, Rendering(images, torch.ones(2, 16, 16), torch.full((2, 16, 16), 2.0), {})
-
-
-def test_the_inverse_of_an_unknown_depth_is_0():
-    found = inverse_depths(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
-    torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
 
 
 def test_the_comparison_has_a_row_for_each_view_and_true_depths_where_known():

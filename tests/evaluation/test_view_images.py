@@ -66,16 +66,10 @@ DAMAGE = {
         lambda room: shutil.copytree(room, room.parent / "lego"),
         "has lego, named as no scene of the data: rename or remove; the scenes are room",
     ),
-    "no scene": (
-        lambda room: shutil.rmtree(room),
-        "has no folder of 1 of the 1 scenes, room: add them",
-    ),
-    "no folder": (lambda room: shutil.rmtree(room.parent), "other is no folder: name one"),
     "another size": (
         lambda room: Image.new("RGB", (32, 32)).save(room / "00004.png"),
         "00004.png is 32x32 (height x width), and the test views are 24x32: render at that size",
     ),
-    "no pixels": (lambda room: (room / "00004.png").write_bytes(b""), "00004.png"),
 }
 
 

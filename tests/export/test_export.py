@@ -76,9 +76,7 @@ def test_what_cannot_be_written_is_refused_before_the_scene_is_read(file):
     for output, keep, message in (
         (file.with_name("scene.obj"), 1.0, r"scene\.obj cannot be written"),
         (file.with_name("scene.spz"), 0.0, "--keep is 0: give a fraction above 0, at most 1"),
-        (file.with_name("scene.spz"), 1.5, r"--keep is 1\.5"),
         (existing, 1.0, r"old\.spz exists: remove it, or name another file"),
-        (file.with_name("scene.spz"), 1.0, r"missing\.ply is not a file"),
     ):
         with pytest.raises(InputError, match=message):
             export(missing, output, keep)

@@ -54,7 +54,7 @@ def check_equal(read, scene, **tolerances):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("count", [1, 2, 257])
+@pytest.mark.parametrize("count", [1, 257])
 def test_all_but_the_length_of_quats_comes_back_bit_by_bit(make_scene, tmp_path, degree, count):
     scene, _ = make_scene(count, degree=degree, dtype=torch.float32)
     write_glb(tmp_path / "scene.glb", scene)
@@ -188,26 +188,16 @@ def test_integers_and_strides_are_read(tmp_path):
 
 
 SPLATS = ("meshes", 0, "primitives", 0)
-KERNEL = (*SPLATS, "extensions", PREFIX[:-1])
-VIEW, ACCESSOR = ("bufferViews", 0), ("accessors", 0)
 
 
 @pytest.mark.parametrize(
     ("place", "key", "value", "message"),
     [
         ((), "extensionsRequired", ["KHR_draco"], "needs the extension KHR_draco"),
-        ((), "nodes", [], "0 primitives with KHR_gaussian_splatting in its nodes"),
         ((), "nodes", [{"mesh": 0}] * 2, "2 primitives with KHR_gaussian_splatting"),
         (("nodes", 0), "scale", [1, 1, 2], "nodes stretch, shear or mirror"),
-        (("nodes", 0), "scale", [1, 1, -1], "nodes stretch, shear or mirror"),
-        (("nodes", 0), "scale", [0, 0, 0], "nodes stretch, shear or mirror"),
-        (KERNEL, "colorSpace", "BT.2020", "'BT.2020'.* expected .*'srgb_rec709_display'"),
-        (KERNEL, "extensions", {"KHR_spz": {}}, "KHR_spz.* expected uncompressed"),
         (SPLATS, "mode", 4, "expected uncompressed points"),
-        (SPLATS, "attributes", {}, "cannot be read as binary glTF .*POSITION"),
-        (ACCESSOR, "sparse", {"count": 1}, "sparse, compressed"),
-        (VIEW, "extensions", {"EXT_meshopt_compression": {}}, "sparse, compressed"),
-        (VIEW, "buffer", 1, "in another file"),
+        (("accessors", 0), "sparse", {"count": 1}, "sparse, compressed"),
     ],
 )
 def test_what_is_not_read_is_refused(written, place, key, value, message):

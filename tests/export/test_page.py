@@ -93,10 +93,7 @@ def test_a_page_is_small(make_scene, tmp_path):
     ("changes", "message"),
     [
         ({"path": "scene.htm"}, r"scene\.htm is not the name of a page"),
-        ({"path": "missing/scene.html"}, "cannot be written"),
         ({"names": ["a.jpg"]}, "1 names and 3 cameras"),
-        ({"background": (0, 0)}, "background"),
-        ({"background": (0, 0, float("nan"))}, "background"),
     ],
 )
 def test_what_makes_no_page_is_refused(scene, tmp_path, changes, message):
@@ -105,19 +102,6 @@ def test_what_makes_no_page_is_refused(scene, tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         write_page(path, **arguments)
     assert not path.exists()
-
-
-def test_batches_and_invalid_numbers_are_refused(scene, tmp_path):
-    gaussians, cameras = scene
-    path = tmp_path / "scene.html"
-    with pytest.raises(InputError, match=r"expected \[V, 3, 3\]"):
-        write_page(path, gaussians, cameras.map(lambda tensor: tensor[None]))
-    with pytest.raises(InputError, match=r"expected \[V, 3, 3\]"):
-        write_page(path, gaussians, cameras.select(torch.arange(0)))
-    with pytest.raises(InputError, match=r"Cameras\.cam_to_world"):
-        write_page(path, gaussians, replace(cameras, cam_to_world=2 * cameras.cam_to_world))
-    with pytest.raises(InputError, match=r"Gaussians\.scales"):
-        write_page(path, replace(gaussians, scales=-gaussians.scales), cameras)
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +129,9 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(
+    ("degree", "antialiased"), [(0, True), (1, False), (2, True), (3, False), (3, True)]
+)
 def test_the_picture_is_that_of_our_renderer(browser, make_scene, tmp_path, degree, antialiased):
     gaussians, cameras = make_scene(400, 3, HEIGHT, WIDTH, degree=degree, dtype=torch.float32)
     # A third smaller than a pixel, where antialiasing matters.
@@ -324,7 +309,6 @@ def test_the_picture_comes_back_after_a_lost_context(tab):
     ("script", "message"),
     [
         ("HTMLCanvasElement.prototype.getContext = () => null", "has no WebGL 2"),
-        ("delete window.DecompressionStream", "too old"),
         ("Worker = class { constructor() { throw Error('no threads'); } }", "no threads"),
     ],
 )

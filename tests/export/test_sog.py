@@ -12,7 +12,6 @@ from asysplat.export.formats import sog
 from asysplat.export.formats.packing import morton_order
 from asysplat.export.formats.sog import read_sog, write_sog
 from asysplat.geometry.motion import rotations
-from asysplat.scene import Gaussians
 
 
 def check_close(read, scene):
@@ -40,7 +39,7 @@ def spread(values):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("count", [1, 2, 257])
+@pytest.mark.parametrize("count", [1, 257])
 def test_a_scene_comes_back_within_the_format_s_precision(make_scene, tmp_path, degree, count):
     scene, _ = make_scene(count, degree=degree)
     write_sog(tmp_path / "scene.sog", scene)
@@ -141,30 +140,10 @@ def test_deflated_bundles_are_read(written):
     assert torch.equal(read_sog(written).means, scene.means)
 
 
-def test_other_versions_and_bundles_without_their_files_are_refused(written):
+def test_other_versions_are_refused(written):
     def set_version(members):
         members["meta.json"] = members["meta.json"].replace(b'"version":2', b'"version":3')
 
-    for edit, message in (
-        (set_version, r"it has version 3 of SOG: expected 2"),
-        (
-            lambda members: members.pop("quats.webp"),
-            r"cannot be read as a SOG bundle .*quats\.webp",
-        ),
-    ):
-        whole = written.read_bytes()
-        rewrite(written, edit)
-        with pytest.raises(InputError, match=rf"scene\.sog.*{message}"):
-            read_sog(written)
-        written.write_bytes(whole)
-
-
-def test_scenes_that_cannot_be_written_are_refused(make_scene, tmp_path):
-    scene, _ = make_scene()
-    for bad, message in (
-        (replace(scene, opacities=scene.opacities + 1), r"opacities\[0\] lies outside"),
-        (scene.keep(scene.opacities > 2), "no Gaussians"),
-        (Gaussians.stack([scene, scene]), "one by one"),
-    ):
-        with pytest.raises(InputError, match=message):
-            write_sog(tmp_path / "scene.sog", bad)
+    rewrite(written, set_version)
+    with pytest.raises(InputError, match=r"scene\.sog.*it has version 3 of SOG: expected 2"):
+        read_sog(written)

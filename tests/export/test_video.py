@@ -1,12 +1,10 @@
 """Videos, read back frame by frame."""
 
-import sys
 import weakref
 
 import numpy as np
 import pytest
 import torch
-from full_disk import largest_file
 
 from asysplat.errors import InputError
 from asysplat.export import write_video
@@ -108,22 +106,11 @@ def test_a_video_that_fails_leaves_the_old_file(old, images, error, message):
         write_video(old, images)
 
 
-@pytest.mark.parametrize("size", [0, 4000])
-def test_a_full_disk_leaves_the_old_file(old, size):
-    message = r"way\.mp4 cannot be written \(File too large\)"
-    with largest_file(size), pytest.raises(InputError, match=message):
-        write_video(old, (torch.rand(3, 64, 64) for _ in range(40)))
-
-
-def test_write_video_names_wrong_arguments(tmp_path, monkeypatch):
+def test_write_video_names_wrong_arguments(tmp_path):
     for name, fps, message in (
         ("way.avi", 30, r"way\.avi is not the name of a video"),
         ("way.mp4", 0, "fps is 0"),
-        ("absent/way.mp4", 30, r"absent/way\.mp4 cannot be written \(No such file"),
-        ("way.mp4", 30, r"needs PyAV: pip install 'asysplat\[video\]'"),
     ):
-        if "PyAV" in message:
-            monkeypatch.setitem(sys.modules, "av", None)
         with pytest.raises(InputError, match=message):
             write_video(tmp_path / name, [image(0, 16, 16)], fps)
     assert not list(tmp_path.iterdir())

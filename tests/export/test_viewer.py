@@ -1,7 +1,6 @@
 """The viewer: images for its pages, changes of the scene, pages that come and go."""
 
 import json
-import math
 import sys
 import time
 from dataclasses import replace
@@ -60,9 +59,8 @@ def test_mistakes_are_refused(scene, viewer, monkeypatch):
     batch = type(gaussians).stack([gaussians, gaussians])
     with pytest.raises(InputError, match=r"views have the batch dimensions \(1,\)"):
         Viewer(views.map(lambda tensor: tensor[None]), port=0)
-    for show in (viewer.show, lambda batch: Viewer(views, batch, port=0)):
-        with pytest.raises(InputError, match=r"gaussians have the batch dimensions \(2,\)"):
-            show(batch)
+    with pytest.raises(InputError, match=r"gaussians have the batch dimensions \(2,\)"):
+        viewer.show(batch)
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"needs viser: pip install 'viser>=1\.1'"):
         Viewer(views)
@@ -102,9 +100,9 @@ def test_pages_come_and_go_and_show_the_rendering_of_their_cameras(scene, viewer
         assert not viewer._thread.is_alive()
 
 
-@pytest.mark.parametrize("origin", ["http://example.org", "http://127.0.0.1.example.org", "null"])
-def test_pages_of_other_sites_are_refused(viewer, origin):
-    with pytest.raises(InvalidStatus, match="403"), open_page(viewer, origin):
+def test_pages_of_other_sites_are_refused(viewer):
+    address = "http://127.0.0.1.example.org"
+    with pytest.raises(InvalidStatus, match="403"), open_page(viewer, address):
         pass
     with open_page(viewer, viewer.url) as page:
         page.stand(viewer._cameras, 0)
@@ -191,27 +189,6 @@ def test_the_sh_degree_follows_the_scene(scene, viewer):
     viewer._sh_degree.value = 1
     viewer.show(replace(gaussians, sh=torch.zeros(60, 9, 3)))
     assert viewer._sh_degree.value == 1
-
-
-def test_no_value_of_one_page_blinds_the_others(scene, viewer):
-    gaussians, _ = scene
-    shown, cameras = inside(viewer, gaussians)
-    wild = (-1, 10**12, 1e300, math.nan, math.inf, -math.inf)
-    with open_page(viewer) as stranger, open_page(viewer) as page:
-        for each, view in ((stranger, 1), (page, 0)):
-            each.stand(cameras, view)
-        until(lambda: len(viewer._server.get_clients()) == 2)
-        for value in wild:
-            for slider in (viewer._sh_degree, viewer._min_opacity, viewer._size):
-                stranger.set(slider, value)
-                until(lambda slider=slider, value=value: repr(slider.value) == repr(float(value)))
-        stranger.set(viewer._layer, "none")
-        until(lambda: viewer._layer.value == "none")
-        least = {"sh_degree": 0, "min_opacity": 0.0, "size": 0.05}
-        page.picture_like(draw_layer(shown, cameras.select([0]), **least))
-        assert len(viewer._server.get_clients()) == 2
-        stranger.set(viewer._size, 1.0)
-        page.picture_like(draw_layer(shown, cameras.select([0]), sh_degree=0))
 
 
 def test_errors_are_in_the_panel_until_the_next_scene(scene, viewer, monkeypatch):
@@ -304,17 +281,6 @@ def test_the_command_opens_at_the_first_camera_beside_the_scene_upright(scene, f
     assert torch.tensor(first.up).float() @ (turn @ pose[:, 1])[:3] < 0  # y is down
     assert first.fov == pytest.approx(2 * np.arctan(45 / 110))
     assert viewer._cameras.num_views == 4
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"frames": []}', '{"frames": [{"file_path": "a"}]}'])
-def test_a_damaged_file_of_cameras_is_a_line(scene, file, opened, capsys, text):
-    beside = file.with_name("transforms.json")
-    beside.write_text(text)
-    assert cameras_beside(file, scene[0]) is None
-    said = capsys.readouterr().out
-    assert said.startswith(f"without cameras: {beside}") and len(said.splitlines()) == 1
-    main(str(file), None)
-    assert opened[0]._cameras.num_views == 1
 
 
 def test_cameras_of_another_scene_are_a_line(scene, file, capsys):

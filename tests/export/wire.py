@@ -45,11 +45,6 @@ class WirePage:
         }
         self._socket.send(msgspec.msgpack.encode(message))
 
-    def set(self, handle, value) -> None:
-        """Change a setting of the panel."""
-        message = {"uuid": handle._impl.uuid, "updates": {"value": value}}
-        self._socket.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", **message}))
-
     def click(self, cameras, view: int) -> None:
         """Click on a camera's frustum, from behind it."""
         forward = cameras.cam_to_world[view, :3, 2]

@@ -87,15 +87,6 @@ def test_the_report_of_a_good_scene_fits_one_screen_and_overwrites_nothing(check
 
 
 @pytest.mark.medium
-def test_a_name_is_no_markup(check, scene, tmp_path):
-    named = scene.rename(scene.with_name(r"[b] $\frac$ :x:"))
-    code, out, err = check(named, "--out", tmp_path / "[red]")
-    assert code == 0 and not err and f"{named.name}, layout transforms" in out
-    assert f"figure: {tmp_path}/[red]/{named.name}/check.png" in out
-    assert (tmp_path / "[red]" / named.name / "check.png").exists()
-
-
-@pytest.mark.medium
 @pytest.mark.usefixtures("no_figure")
 def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     def unflip(content):
@@ -145,7 +136,6 @@ def test_errors_of_the_check_are_one_line(check):
     for arguments, message in (
         (("nowhere",), "nowhere does not exist"),
         (("data/walk", "--out", "data/walk/check"), "lies in the data set"),
-        (("data", "--layout", "transforms", "--out", "data"), "lies in the data set"),
     ):
         code, _, err = check(*arguments)
         assert code == 2 and message in err

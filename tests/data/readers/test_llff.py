@@ -50,13 +50,6 @@ def test_all_bad_images_are_listed_or_left_out(scene):
     )
 
 
-def test_other_arrays_are_refused(scene):
-    file = scene / "poses_bounds.npy"
-    np.save(file, np.load(file)[:, :15])
-    with pytest.raises(InputError, match=r"poses_bounds\.npy holds \(12, 15\): expected a row"):
-        open_llff(scene)
-
-
 def test_points_of_a_model_beside_the_images_are_read(scene, centered_views, tmp_path):
     model = colmap_layout.write(centered_views, tmp_path / "model")
     for index in range(12):

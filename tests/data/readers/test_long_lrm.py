@@ -77,9 +77,3 @@ def test_all_bad_images_are_listed_or_left_out(scene):
         total=12,
     )
     assert names_of(sequence) == [f"frame{10 * index}.png" for index in (0, 1, 3, *range(7, 12))]
-
-
-def test_a_list_that_names_a_missing_json_is_refused(listed):
-    listed.write_text("gone/opencv_cameras.json")
-    with pytest.raises(InputError, match=r"gone/opencv_cameras\.json does not exist"):
-        opened(listed)

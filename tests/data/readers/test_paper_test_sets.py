@@ -67,12 +67,6 @@ def test_tables_2_and_3_test_their_zero_shot_sets(tests_of):
         tests_of("test_sets=[replica]", f"{only}=[room9]")
 
 
-def test_table_a2_tests_sets_with_depths(tests_of):
-    tests = tests_of("sweeps=mamba_ratio")
-    assert list(tests) == ["dl3dv", "mipnerf360", "scannetpp"]
-    assert (tests["scannetpp"]["targets"].depths > 0).any()
-
-
 def test_table_5_tests_the_views_of_its_index(tests_of):
     tests = tests_of("sweeps=two_views", "test_sets=[realestate10k]", "data.inputs=3")
     assert counts(tests["realestate10k"]) == (2, 3) and counts(tests["dl3dv"]) == (3, 2)

@@ -65,10 +65,6 @@ def transposed(row):
             lambda room: save_image(room / "results/frame000002.jpg", torch.ones(3, 12, 16)),
             "cam_params.json is for 32 x 24",
         ),
-        "nan": (
-            set_row(2, lambda row: f"nan {row.split(maxsplit=1)[1]}"),
-            "row 3 is not 4x4 or",
-        ),
         "world-to-camera": (set_row(2, transposed), "traj.txt, row 3 has last row"),
     }
 )
@@ -77,14 +73,7 @@ def test_a_bad_image_is_named_or_left_out(room, damage, message):
     assert_listed(opened, room, message)
 
 
-@table(
-    {
-        "more images than rows": (set_row(3, lambda row: ""), "traj.txt has 3 rows for 4 images"),
-        "no parameters": (lambda room: parameters(room).unlink(), "cam_params.json does not exist"),
-        "no focal length": (set_camera(fx=0), "has 0 usable image"),
-    }
-)
-def test_a_broken_scene_is_refused(room, damage, message):
-    damage(room)
-    with pytest.raises(InputError, match=message):
+def test_more_images_than_poses_are_refused(room):
+    set_row(3, lambda row: "")(room)
+    with pytest.raises(InputError, match=r"traj.txt has 3 rows for 4 images"):
         opened(room, on_error="skip")
