@@ -17,7 +17,6 @@ LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
 LOST_PEER = RuntimeError("[/gloo/transport/tcp/pair.cc:545] Read error: Connection reset by peer.")
 SENTENCES = {
     "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
-    "a full disk": (FULL, "no space on the disk for logs/events (No space left on device)"),
     "a full disk behind": (FULL_AS_CAUSE, "no space on the disk"),
     "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no space on the disk (Disk quota"),
     "a full GPU": (
@@ -25,13 +24,7 @@ SENTENCES = {
         "no memory left (CUDA out of memory. Tried to allocate 2.00 GiB): choose fewer",
     ),
     "a full memory": (MemoryError(), "no memory left (no reason given): choose fewer"),
-    "a full memory behind a file": (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory left"),
     "a lost peer": (LOST_PEER, "the connection to another process of this training was lost"),
-    "a lost peer by NCCL": (
-        torch.distributed.DistBackendError("NCCL error: remote process exited or there was a"),
-        "the connection to another process of this training was lost",
-    ),
-    "no thread": (RuntimeError("can't start new thread"), "memory left (can't start new thread)"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }
 

@@ -11,8 +11,6 @@ from pathlib import Path
 import cv2
 import nbformat
 import pytest
-from nbclient import NotebookClient
-from tiny import NETWORK, VIEWS
 
 from asysplat import read_gaussians, refine
 from asysplat.data import SceneOptions, open_scene
@@ -84,17 +82,6 @@ def test_the_notebook_holds_no_outputs_and_its_code_runs(notebook, few_steps, ca
     assert read_gaussians(scene).num_gaussians > 1000
 
 
-@pytest.mark.slow
-def test_the_notebook_runs_in_a_kernel(notebook, repository, tmp_path):
-    # What it imports is this copy of the project.
-    first = nbformat.v4.new_code_cell(f"import sys; sys.path.insert(0, {str(repository)!r})")
-    notebook.cells.insert(0, first)
-    NotebookClient(notebook, timeout=500, resources={"metadata": {"path": tmp_path}}).execute()
-    outputs = [out for cell in notebook.cells for out in cell.get("outputs", ())]
-    assert "image/png" in [kind for out in outputs for kind in out.get("data", ())]
-    assert read_gaussians(outputs[-1].text.strip()).num_gaussians > 1000
-
-
 @pytest.mark.medium
 def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
     heavy = ["lightning", "hydra", "cv2", "matplotlib", "pycolmap"]
@@ -120,44 +107,23 @@ def test_help_imports_nothing_that_takes_long(repository, command):
     assert "argparse" in imported and not imported & {"torch", "numpy", "rich"}
 
 
-@pytest.fixture
-def written_scene(run_example, tmp_path):
-    run_example("write_scene", tmp_path / "my_scene")
-    assert open_scene(tmp_path / "my_scene", SceneOptions(64, 64)).num_images == 48
-    return tmp_path / "my_scene"
-
-
-def train_on_photographs(repository, scene, python: Path, *options):
-    """Run the script with this folder's python."""
-    return subprocess.run(
-        ["bash", repository / "examples" / "train_on_photographs.sh", scene, *options],
-        env={**os.environ, "PATH": f"{python}:{os.environ['PATH']}"},
-        cwd=scene.parent,
+@pytest.mark.medium
+def test_the_commands_for_photographs_are_those_of_the_scripts(repository, tmp_path, run_example):
+    """A program in Python's place prints its words."""
+    folder, written_scene = tmp_path, tmp_path / "my_scene"
+    run_example("write_scene", written_scene)
+    assert open_scene(written_scene, SceneOptions(64, 64)).num_images == 48
+    (folder / "python").write_text('#!/bin/sh\necho "$@"\n')
+    (folder / "python").chmod(0o755)
+    done = subprocess.run(
+        ["bash", repository / "examples" / "train_on_photographs.sh", written_scene, "steps=1"],
+        env={**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"},
+        cwd=folder,
         capture_output=True,
         text=True,
     )
-
-
-@pytest.mark.medium
-def test_the_commands_for_photographs_are_those_of_the_scripts(repository, written_scene):
-    """A program in Python's place prints its words."""
-    folder = written_scene.parent
-    (folder / "python").write_text('#!/bin/sh\necho "$@"\n')
-    (folder / "python").chmod(0o755)
-    done = train_on_photographs(repository, written_scene, folder, "steps=1")
     check, train = (line.split() for line in done.stdout.splitlines())
     assert check == ["-m", "asysplat.data.check", str(written_scene)]
     assert Path(train[0]).samefile(repository / "train.py") and train[-1] == "steps=1"
     assert f"data.root={written_scene}" in train
     check_overrides(train[1:])
-
-
-@pytest.mark.slow
-def test_photographs_are_checked_and_trained_on(repository, written_scene):
-    logs = written_scene.parent / "logs"
-    tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
-    tiny += [f"paths.logs={logs}", "~callbacks.figures"]
-    done = train_on_photographs(repository, written_scene, Path(sys.executable).parent, *tiny)
-    assert done.returncode == 0, done.stderr
-    assert "The cameras fit the images." in done.stdout
-    assert len(list(logs.glob("photographs/*/metrics.json"))) == 1

@@ -42,7 +42,6 @@ def test_a_closed_terminal_ends_the_process_like_sigterm(repository, nohup):
 # Each with a function that it calls first.
 COMMANDS = {
     "examples/reconstruct_scene.py": "asysplat.data:ProceduralScene",
-    "asysplat/export/viewer.py": "asysplat.export.gaussians:read_gaussians",
     "asysplat/data/check/__main__.py": "asysplat.data.readers:find_scenes",
 }
 

@@ -3,7 +3,6 @@
 import itertools
 import re
 import shlex
-import subprocess
 import sys
 
 import pytest
@@ -22,14 +21,10 @@ KNOWN = [
     [],
     ["model=asysplat_4m4s", "scale=paper", "steps=5", "model.layers=7m1t"],
     ["model=longlrm,asysplat_4m4s", "seed=0,1,2", "learning_rate=choice(1e-3,1e-4)"],
-    ["stage=stage2", "scale=gpu"],
-    ["stage=stage1,stage2,stage3", "experiment=two_views"],
     ["sweeps=layers", "hydra/launcher=joblib", "hydra.run.dir=x", "model=asysplat_7m1s"],
-    ["data=files", "data.root=my scenes/one", "data.cache.folder=null"],
     ["model/links=both", "~callbacks.costs", "trainer=cpu", "trainer.devices=2"],
     ["~callbacks", "seed=range(3)", "model=glob(asysplat_*)"],
     ["+data.test_sets.more_views.inputs=16", "data.test_sets.more_views.inputs=8", "++new=1"],
-    ["+data.test_sets.more_views={inputs: 5, test_scenes: 2}"],
 ]
 
 
@@ -41,16 +36,10 @@ def test_known_overrides_are_taken_in_any_folder(known, tmp_path, monkeypatch):
 
 UNKNOWN = {
     "widht=0.5": "Could not override 'widht': did you mean width?",
-    "modle=asysplat_4m4s": "did you mean model?",
     "data.inptus=4": "Could not override 'data.inptus': did you mean data.inputs?",
-    "training.learning_rate=1e-3": "did you mean learning_rate?",
-    "trainer.steps=5": "did you mean steps?",
     "weight_decay=0": "did you mean training.optimizer.weight_decay?",
     "stage=stage1,stage4": "stage=stage4 is unknown: choose from stage1, stage2, stage3, ablation.",
-    "batch_sizes=2,4": "did you mean data.batch_size?",
-    "callbacks.pictres.scenes=1": "did you mean callbacks.figures.scenes?",
     "~callbacks.cots": "'callbacks.cots' does not exist: did you mean callbacks.costs?",
-    "qqq=1": "Could not override 'qqq'.",
     "model=longlrm,asysplat_4m4z": "Could not find 'model/asysplat_4m4z': did you mean model/",
     "model/links=bth": "did you mean model/links/both?",
     "steps": "steps cannot be read: write option=value",
@@ -73,12 +62,6 @@ def test_options_of_the_other_scripts():
         ("benchmark", "suite=ops ops.ssd.length=512 model.names=[longlrm]", "repeat=3", "repeats"),
         (
             "evaluate",
-            "run=logs/asysplat/one post_optimization_steps=[0,5] paths.logs=elsewhere",
-            "gausians=a",
-            "gaussians",
-        ),
-        (
-            "evaluate",
             "init_path=shipped data=files data.root=x scale=gpu",
             "gausians=a.ply",
             "gaussians",
@@ -89,15 +72,7 @@ def test_options_of_the_other_scripts():
             check_overrides([unknown], script)
 
 
-@pytest.mark.medium
-def test_a_script_says_it_from_any_folder(repository, tmp_path):
-    command = [sys.executable, repository / "report.py", "cots=true"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert result.returncode != 0
-    assert result.stderr == "error: Could not override 'cots': did you mean costs?\n"
-
-
-@pytest.mark.parametrize("name", ["0_model=longlrm", "my (scene)", "it's [1]", "plain", "0.5"])
+@pytest.mark.parametrize("name", ["my (scene)", "it's [1]", "0.5"])
 def test_existing_paths_need_no_quotes_of_their_own(tmp_path, monkeypatch, name):
     (tmp_path / name).mkdir()
     monkeypatch.setattr("sys.argv", ["evaluate.py", f"run={tmp_path / name}", "width=0.5"])

@@ -15,16 +15,6 @@ from asysplat.data.write import write_transforms
 
 ENVIRONMENT = dict(os.environ)
 pytestmark = pytest.mark.medium
-FIVE_LINES = """
-import asysplat
-from asysplat import load, open_photographs, refine, write_gaussians
-
-photographs = open_photographs("my_scene", height=32, width=32, views=4)
-gaussians = load("shipped")(photographs.inputs)
-gaussians = refine(gaussians, photographs.inputs, steps=2)
-write_gaussians("scene.ply", photographs.normalization.to_world(gaussians))
-print(asysplat.__file__)
-"""
 
 
 def build(source, kind, folder):
@@ -77,10 +67,6 @@ def test_every_configuration_is_in_the_wheel(repository, wheel):
     files = [*repository.glob("conf/**/*.yaml"), *repository.glob("checkpoints/*")]
     names = {f"asysplat/installed/{path.relative_to(repository)}" for path in files}
     assert names <= contents(wheel).keys()
-
-
-def test_five_lines_reconstruct_photographs(run):
-    assert "site" in run(sys.executable, "-c", FIVE_LINES)
 
 
 def test_the_command_reconstructs_photographs(run):

@@ -3,7 +3,6 @@
 import csv
 import json
 import os
-import random
 import shutil
 import signal
 import subprocess
@@ -23,10 +22,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from pretend_device import DEVICE, pretended_device
 from safetensors import safe_open
-from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
-from asysplat import Gaussians, open_photographs, read_gaussians, render
+from asysplat import Gaussians, read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
@@ -61,7 +59,10 @@ def photographs(views, tmp_path_factory):
 @pytest.fixture
 def command(run_script, tmp_path):
     """The script in this process with tiny options by default; its folder is tmp_path/run."""
+    return make_command(run_script, tmp_path / "run")
 
+
+def make_command(run_script, folder):
     def run(path, *overrides):
         keys = [override.split("=")[0] for override in overrides]
         tiny = [option for option in TINY if option.split("=")[0] not in keys]
@@ -69,8 +70,14 @@ def command(run_script, tmp_path):
         shutil.rmtree(folder, ignore_errors=True)  # else the next one is run-2
         return run_script("reconstruct.py", *words, *overrides, *tiny, f"paths.run={folder}")
 
-    folder = tmp_path / "run"
     return run
+
+
+@pytest.fixture(scope="module")
+def first(run_script, photographs, tmp_path_factory):
+    """The folder of a finished reconstruction, and what the script said."""
+    folder = tmp_path_factory.mktemp("first") / "run"
+    return folder, finished(make_command(run_script, folder)(photographs))
 
 
 def finished(result):
@@ -104,20 +111,17 @@ def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, mo
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
     numbers = numbers_of(tmp_path / "run")
     # In float32 a kernel and torch's operators part after some steps of Adam.
-    for name, tolerance in {
-        "inputs/psnr": 0.01,
-        "held_out/psnr": 0.01,
-        "held_out/absrel": 0.05,
-    }.items():
+    for name, tolerance in (
+        ("inputs/psnr", 0.01),
+        ("held_out/psnr", 0.01),
+        ("held_out/absrel", 0.05),
+    ):
         assert numbers[name] == pytest.approx(expected[name], rel=tolerance)
 
 
 @pytest.mark.medium
-def test_the_result_folder_has_every_file_and_beats_the_baselines(
-    command, views, photographs, tmp_path
-):
-    said = finished(command(photographs))
-    folder = tmp_path / "run"
+def test_the_result_folder_has_every_file_and_beats_the_baselines(first, views, photographs):
+    folder, said = first
     assert {path.name for path in folder.iterdir()} == FILES
     numbers = numbers_of(folder)
     for baseline in ("nearest_view", "mean_color"):
@@ -145,23 +149,23 @@ def test_the_result_folder_has_every_file_and_beats_the_baselines(
 
 @pytest.mark.medium
 def test_a_last_fit_has_the_held_out_photographs_and_leaves_the_metrics(
-    command, views, photographs, tmp_path
+    command, first, views, photographs, tmp_path
 ):
-    errors, metrics = {}, {}
     held_out = views.select([0, 8])
-    for share in (0, 1):
-        finished(command(photographs, f"last_fit={share}", "video.path=none"))
-        folder = tmp_path / "run"
-        metrics[share] = numbers_of(folder) | {"seconds": None}
+
+    def error(folder):
         gaussians = read_gaussians(folder / "scene.ply")
         image = render(gaussians, held_out.cameras, held_out.images.mean((0, 2, 3))).image
-        errors[share] = (image - held_out.images).square().mean()
-    assert metrics[0] == metrics[1]
-    assert errors[1] < 0.7 * errors[0]
+        return (image - held_out.images).square().mean()
+
+    finished(command(photographs, "last_fit=1", "video.path=none"))
+    before, after = first[0], tmp_path / "run"
+    assert numbers_of(after) | {"seconds": None} == numbers_of(before) | {"seconds": None}
+    assert error(after) < 0.7 * error(before)
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("unit", [0.1, 1e3])
+@pytest.mark.parametrize("unit", [pytest.param(0.1, marks=pytest.mark.slow), 1e3])
 def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = torch.tensor(Rotation.from_euler("xyz", (0.4, -1.1, 2.0)).as_matrix())
@@ -239,17 +243,17 @@ def test_the_same_steps_and_seed_give_the_same_bytes(command, photographs, tmp_p
 
 @pytest.mark.medium
 @pytest.mark.parametrize("init", ["network", "depth", "points", "file"])
-def test_each_init_beats_its_baseline(command, views, photographs, tmp_path, monkeypatch, init):
-    folder = tmp_path / "run"
+def test_each_init_beats_its_baseline(
+    command, first, views, photographs, tmp_path, monkeypatch, init
+):
     if init == "points":
         monkeypatch.syspath_prepend(LAYOUTS)
         photographs = import_module("layouts.colmap").write(views, tmp_path / "colmap")
     elif init == "file":
-        finished(command(photographs))
-        init = (folder / "scene.ply").rename(tmp_path / "a first scene.ply")
-        before = numbers_of(folder)
+        init = shutil.copy(first[0] / "scene.ply", tmp_path / "a first scene.ply")
+        before = numbers_of(first[0])
     assert f"init={init}" in finished(command(photographs, f"init='{init}'", "steps=40"))
-    after = numbers_of(folder)
+    after = numbers_of(tmp_path / "run")
     if init == "points":  # a few, at the rims of the photographs
         assert after["inputs/psnr"] > after["baseline/mean_color/psnr"]
     elif Path(init).suffix:  # goes on where the other was
@@ -356,8 +360,6 @@ def test_only_what_describes_the_photographs_is_taken_from_a_run(run_folder, scr
     ("content", "message"),
     [
         ({"height": 9}, "config.yaml has no path of photographs"),
-        ({"path": {"a": 1}}, "config.yaml has no path of photographs"),
-        ({"path": "a", "views": [1]}, r"config.yaml: views is \[1\]: expected a word or a"),
         ({"path": "a", "x": {"_target_": "os.system"}}, "os.system"),
         (None, "has no scene.safetensors: name the folder of a finished run, or last"),
     ],
@@ -384,13 +386,12 @@ def test_only_a_start_from_the_network_reads_its_weights(command, photographs):
 @pytest.mark.medium
 def test_odd_paths_and_the_end_by_max_steps_per_image(command, photographs, tmp_path):
     limit = ("refinement.max_steps_per_image=2", "steps=null", "seconds=600")
-    for name in ("it's \"a\" \\'scene\\", "a=b, [c]"):
-        (tmp_path / name).symlink_to(photographs)
-        said = finished(command(tmp_path / name, "views=3", "video.path=none", *limit))
-        config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-        assert config["path"] == str(tmp_path / name) and "views=3" not in said
-        assert "ended after refinement.max_steps_per_image=2" in said
-        assert numbers_of(tmp_path / "run")["steps"] == 6
+    path = tmp_path / "it's \"a=b\", [c] \\'scene\\"
+    path.symlink_to(photographs)
+    said = finished(command(path, "views=3", "video.path=none", *limit))
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["path"] == str(path)
+    assert "ended after refinement.max_steps_per_image=2" in said
+    assert numbers_of(tmp_path / "run")["steps"] == 6
 
 
 @pytest.fixture
@@ -416,17 +417,11 @@ def test_the_first_word_is_the_path(script):
 REFUSED = {
     "": "no photographs: python reconstruct.py my_scene",
     "heigth=9": "'heigth': did you mean height?",
-    "last_fit=2": "last_fit=2 should be less than or equal to 1.",
-    "init=absent.ply": "absent.ply",
-    "video.height=0": "video.height=0 should be greater than or equal to 2.",
     "video.path=[00001.png,x.png]": "video.path: x.png is the name of none of the 14 photographs",
     "refinement.densify_until=2.5": "refinement.densify_until=2.5 should be less than",
     "output=[ply,obj]": "output has 'obj': choose from compressed.ply, ply, spz, sog, glb, splat,",
     "output=[ply] open=true": "open=true opens the page, which output= leaves out: add html to it",
-    "refinement=scaffold_gs output=[ply]": "output=[ply]: the Gaussians of refinement=scaffold_gs "
-    "depend on the view, so no file or viewer holds them: leave it out",
     "refinement=scaffold_gs last_fit=0.2": "last_fit=0.2: the Gaussians of refinement=scaffold_gs",
-    "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
 }
 
 
@@ -444,26 +439,19 @@ def test_a_mistake_is_one_sentence_and_status_1(command, photographs, tmp_path, 
     assert not list(tmp_path.rglob("scene.*"))
 
 
-LIMITS = [
-    (None, None, "seconds=null should be a valid number."),
-    (None, 0, "seconds=0 should be greater than 0."),
-    (None, "long", "seconds=long should be a valid number."),
-    (0, None, "steps=0 should be greater than or equal to 1."),
-    (0.5, None, "steps=0.5 should be a valid integer."),
-]
-
-
-@pytest.mark.parametrize(("steps", "seconds", "message"), LIMITS)
-def test_read_limit_takes_a_number_above_0(script, monkeypatch, steps, seconds, message):
-    monkeypatch.setattr(script, "given_options", set)
+@pytest.mark.parametrize(
+    ("steps", "seconds", "message"),
+    [
+        (None, 0, "seconds=0 should be greater than 0."),
+        (0.5, None, "steps=0.5 should be a valid integer."),
+        (3, 5, "seconds=5 and steps=3: give one of them"),
+    ],
+)
+def test_one_limit_above_0_is_given(script, monkeypatch, steps, seconds, message):
+    given = {"steps", "seconds"} if steps and seconds else set()
+    monkeypatch.setattr(script, "given_options", lambda: given)
     with pytest.raises(InputError, match=message):
         script.read_limit(OmegaConf.create({"steps": steps, "seconds": seconds}))
-
-
-def test_steps_and_seconds_are_not_given_together(script, monkeypatch):
-    monkeypatch.setattr(script, "given_options", lambda: {"steps", "seconds"})
-    with pytest.raises(InputError, match="seconds=5 and steps=3: give one of them"):
-        script.read_limit(OmegaConf.create({"steps": 3, "seconds": 5}))
 
 
 def test_run_last_without_any_run_names_the_folder(tmp_path):
@@ -472,26 +460,10 @@ def test_run_last_without_any_run_names_the_folder(tmp_path):
         continue_run(config, ())
 
 
-def test_photographs_that_are_not_there_or_have_no_size_are_refused(photographs):
-    with pytest.raises(InputError, match="absent does not exist: name a scene"):
-        open_photographs("absent", height=SIZE)
-    with pytest.raises(InputError, match="height=0 should be greater"):
-        open_photographs(photographs, height=0)
-
-
 def test_too_few_photographs_are_refused(command, views, tmp_path):
     write_transforms(views.select([0, 5]), tmp_path / "two")
     message = "has 2 photographs, of which held_out_every=8 leaves 1"
     check_refusal(command(tmp_path / "two"), message)
-
-
-@pytest.mark.medium
-def test_a_checkpoint_of_another_model_is_refused(command, photographs, tmp_path):
-    file = tmp_path / "other.safetensors"
-    save_file({"net.layer": torch.zeros(2)}, file)
-    result = command(photographs, "init=network", f"checkpoint={file}")
-    check_refusal(result, f"{file} does not fit this model, ")
-    assert result.stderr.count(" there and ") == 5 and ", ...; give the options" in result.stderr
 
 
 @pytest.mark.medium
@@ -504,21 +476,9 @@ def test_cameras_without_overlap_end_without_an_error(command, views, tmp_path):
 
 
 @pytest.mark.medium
-def test_logs_that_cannot_be_written_are_refused(command, photographs, tmp_path):
-    (tmp_path / "run").write_text("a file")
-    check_refusal(command(photographs), str(tmp_path / "run"))
-
-
-@pytest.mark.medium
 def test_small_photographs_are_measured_without_lpips(command, photographs, tmp_path, shared):
-    small = (
-        "height=24",
-        "views=4",
-        "steps=2",
-        "video.path=none",
-        f"paths.weights={shared}/weights",
-    )
-    result = command(photographs, *small)
+    small = ("height=24", "views=4", "steps=2", "video.path=none")
+    result = command(photographs, *small, f"paths.weights={shared}/weights")
     finished(result)
     assert "without LPIPS" in result.stderr
     assert "held_out/lpips" not in numbers_of(tmp_path / "run")
@@ -577,7 +537,6 @@ def as_in_a_terminal():
     "numbers",
     [
         [signal.SIGINT],
-        [signal.SIGTERM],
         [signal.SIGTERM, signal.SIGHUP, signal.SIGHUP, signal.SIGTERM],
         [signal.SIGINT, signal.SIGINT],
     ],
@@ -600,20 +559,3 @@ def test_the_first_signal_saves_and_the_second_interrupt_stops(process, tmp_path
     else:
         assert running.returncode == 1 and errors.endswith("stopped.\n"), errors
         assert not list((tmp_path / "run").glob(".*"))
-
-
-@pytest.mark.slow
-def test_interrupts_at_random_moments_leave_complete_files_or_none(process, tmp_path):
-    clock = time.monotonic()
-    said, _ = (running := process("seconds=2")).communicate(timeout=200)
-    assert running.returncode == 0, said
-    lasts, moments = time.monotonic() - clock, random.Random(0)
-    for number in 5 * (signal.SIGINT, signal.SIGTERM):
-        running = process("seconds=2", f"seed={moments.randrange(1000)}")
-        time.sleep(moments.uniform(0.1, 1.0) * lasts)
-        running.send_signal(number)
-        _, errors = running.communicate(timeout=200)
-        assert "Traceback" not in errors and running.returncode in (0, 1, -number), errors
-        for file in tmp_path.glob("run*/scene.*"):
-            assert read_gaussians(file).num_gaussians > 0
-            file.unlink()

@@ -1,13 +1,8 @@
 """Names and options of a stranger are printed as they are."""
 
 import ast
-from pathlib import Path
 
-from omegaconf import OmegaConf
-
-from asysplat.runs.runs import Run
 from asysplat.terminal import make_console, print_table
-from asysplat.training.sweep_table import sweep_table
 
 HOSTILE = "[/b] [red]x :smile: test_sets=[replica]"
 
@@ -19,16 +14,6 @@ def test_names_are_printed_as_they_are(capsys, monkeypatch):
     assert capsys.readouterr().out.count(HOSTILE) == 4
     make_console(stderr=True).print(HOSTILE)
     assert capsys.readouterr() == ("", f"{HOSTILE}\n")
-
-
-def test_a_sweep_shows_its_options_as_they_are(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    config = OmegaConf.create({"data": {"name": HOSTILE}, "metrics": {"name": "[/]"}})
-    run = Run(Path(), "", 0, "", {"cost/parameters": 1.0})
-    jobs = [({"test_sets": value}, config, run) for value in ("[replica]", "[/b]")]
-    make_console().print(sweep_table(jobs))
-    out = capsys.readouterr().out
-    assert f"test scenes: {HOSTILE}, metrics: [/]" in out and "[replica]" in out and "[/b]" in out
 
 
 def test_no_other_console_is_made(repository):
