@@ -15,11 +15,7 @@ Result = TypeVar("Result")
 
 
 class BadImages:
-    """Errors of single images, collected while a scene is read.
-
-    Args:
-        policy: "fail", or "skip" to go on without the images that cannot be used.
-    """
+    """Errors of single images of a scene; with the policy "skip" the others are used."""
 
     def __init__(self, policy: Policy = "fail"):
         if policy not in ("fail", "skip"):
@@ -52,8 +48,8 @@ class BadImages:
         bad, total = len(self.errors), usable + len(self.errors)
         different = list(dict.fromkeys(self.errors))
         listed = "".join(f"\n  {error}" for error in different[:MAX_LISTED])
-        more = len(different) - MAX_LISTED
-        listed += f"\n  and {more} more" if more > 0 else ""
+        if len(different) > MAX_LISTED:
+            listed += f"\n  and {len(different) - MAX_LISTED} more"
         if bad and self.policy == "fail":
             raise InputError(
                 f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "

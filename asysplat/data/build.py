@@ -17,13 +17,12 @@ MODULE_OPTIONS = set(inspect.signature(SceneDataModule).parameters) - {*SIZE, "s
 
 
 def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDataModule:
-    """Build a data module of synthetic scenes.
+    """Build a data module of synthetic scenes from its options and those of ProceduralSource.
 
     Args:
         test_sets: name -> the options in which a further test set differs: inputs, targets, height,
             width, num_images, test_scenes or places; and prune (see Task).
-        options: options of ProceduralSource and SceneDataModule; and test_size, the height and
-            width of every test set that does not set its own, None for the size of training.
+        options: also test_size, the height and width of every test set that does not set its own.
     """
     sets = tested_sets(test_sets, options["name"], on_disk=False)
     changeable = ("num_images", "test_scenes", "places")
@@ -31,13 +30,11 @@ def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> Sc
 
 
 def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDataModule:
-    """Build a data module of scenes on disk.
+    """Build a data module of scenes on disk from its options, FilesSource's and SceneOptions'.
 
     Args:
-        test_sets: as for `procedural_data`; the options are inputs, targets, height, width, prune,
-            layout, scenes, selection, index and root. A set whose root is null is left out, with a
-            warning.
-        options: options of FilesSource, SceneOptions and SceneDataModule; and test_size.
+        test_sets: as for `procedural_data`, of inputs, targets, height, width, prune, layout,
+            scenes, selection, index and root. A set whose root is null is left out, with a warning.
     """
     missing = [
         name

@@ -24,11 +24,8 @@ FILL_AFTER_CLEARING = 0.9  # fraction of the limit to which a full disk cache is
 class ImageCache:
     """Arrays by key. A key covers everything an array is made from, so no entry can be outdated.
 
-    Processes may share the folder; each has memory of its own.
-
-    Args:
-        folder: on disk, made at the first write; null writes nothing.
-        disk_gb, memory_gb: limits, in 2^30 bytes.
+    Processes may share the folder, which is made at the first write; each has memory of its own.
+    The limits are in 2^30 bytes.
     """
 
     def __init__(
@@ -106,8 +103,7 @@ def _files(folder: Path) -> list[tuple[float, int, Path]]:
 def _read(file: Path) -> ndarray | None:
     """Read a file and mark it as used; None if it is missing or damaged."""
     try:
-        array = np.load(file, allow_pickle=False)
         os.utime(file)
+        return np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
-    return array

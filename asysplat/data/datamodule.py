@@ -62,9 +62,8 @@ class SceneDataModule(lightning.LightningDataModule):
     """Lightning's data module of tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run depends only on the seed and i,
-    and an epoch continues where the previous one ended. The tasks of a step, and
-    the scenes of an evaluation, are assigned to processes round-robin: Lightning needs
-    use_distributed_sampler=False.
+    and an epoch continues where the previous one ended. The tasks of a step, and the scenes of an
+    evaluation, go to processes round-robin: Lightning needs use_distributed_sampler=False.
 
     Args:
         name: the data set's name in metrics.
@@ -161,11 +160,7 @@ class SceneDataModule(lightning.LightningDataModule):
             raise InputError(f"data.test_sets.{test_set}: {error}") from error
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
-        """Call `check(height, width)` for every set; its InputError names the set.
-
-        Raises:
-            InputError: what `check` raises, with the name of the set.
-        """
+        """Call `check(height, width)` for every set; its InputError names the set."""
         check(self.height, self.width)
         for name, tasks in self.tests.items():
             try:
@@ -175,11 +170,7 @@ class SceneDataModule(lightning.LightningDataModule):
                 raise InputError(f"{where}: {error}") from error
 
     def check_views(self, check: Callable[[int], None]) -> None:
-        """Call `check(inputs)` for every set; its InputError names the set.
-
-        Raises:
-            InputError: what `check` raises, with the name of the set.
-        """
+        """Call `check(inputs)` for every set; its InputError names the set."""
         check(self.inputs)
         for name, tasks in self.tests.items():
             with self._naming(name):
@@ -200,10 +191,9 @@ class SceneDataModule(lightning.LightningDataModule):
         return self.tasks(trainer.current_epoch * count, count, batches_done(trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
-        """Return this process's micro-batches of the tasks `start` to `start + count`.
+        """Return this process's micro-batches of `count` tasks from `start` on, after `done`.
 
-        Leaves out the first `done` micro-batches. A step has the same tasks for any number of
-        processes.
+        A step has the same tasks for any number of processes.
         """
         rank, processes = self._process
         micro_batch = self.split(processes).micro_batch
@@ -235,16 +225,15 @@ class SceneDataModule(lightning.LightningDataModule):
         """Return this process's scenes, one per batch; one with fewer scenes repeats its last."""
         # Processes with unequally many batches would wait for each other.
         rank, processes = self._process
-        turns = range(-(-len(scenes) // processes))
         last = max(range(rank, len(scenes), processes), default=0)
-        indices = [min(turn * processes + rank, last) for turn in turns]
+        indices = [min(first + rank, last) for first in range(0, len(scenes), processes)]
         return DataLoader(Subset(scenes, indices), collate_fn=collate)
 
 
 class TrainingTasks(Dataset):
     """An endless list of training tasks; task i is drawn with its own generator.
 
-    A sample's `bad_scenes` lists the errors of scenes that were drawn before and cannot be used.
+    A sample's `bad_scenes` are the errors of scenes that were drawn before and cannot be used.
     """
 
     def __init__(self, data: SceneDataModule):
@@ -279,10 +268,7 @@ class TrainingTasks(Dataset):
 
 
 class FixedTasks(Dataset):
-    """Evaluation tasks; the first ones stay in memory, up to MAX_LOADED_BYTES.
-
-    The terminal shows the progress of loading them, under their `name`.
-    """
+    """Evaluation tasks; the first ones are loaded into memory, up to MAX_LOADED_BYTES."""
 
     def __init__(self, tasks: Sequence[Task], points: bool = False, name: str = ""):
         self.tasks, self.points = tasks, points
@@ -291,8 +277,8 @@ class FixedTasks(Dataset):
         # Processes side by side would draw over each other; `rank` is set by Lightning.
         rank = rank_zero_only.rank  # ty: ignore[missing-attribute]
         alone = rank == 0 and current_process().name == "MainProcess"
-        shown = track(tasks, escape(f"loading {name}"), transient=True, disable=not alone)
-        for task in shown:
+        title = escape(f"loading {name}")
+        for task in track(tasks, title, transient=True, disable=not alone):
             self._loaded.append(load(task, points=points))
             size += sum(self._loaded[-1][views].images.nbytes for views in ("inputs", "targets"))
             if size > MAX_LOADED_BYTES:

@@ -19,10 +19,7 @@ COMPARED_SIDE = 640  # pixels of the longer side at which sharpness is compared
 
 
 def save_sharp_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
-    """Save the sharpest frame of each of `count` equal parts of a video, upright, as NNNNN.png.
-
-    All frames if there are fewer.
-    """
+    """Save the sharpest frame of each of `count` equal parts of a video, upright, as NNNNN.png."""
     with _video(video) as (container, stream):
         times = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
     if not times:

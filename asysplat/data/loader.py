@@ -26,12 +26,7 @@ class BatchSplit:
 
 
 def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> BatchSplit:
-    """Divide a global batch evenly.
-
-    Args:
-        micro_batch: the most scenes that a process may hold at a time; fewer where these do not
-            divide its scenes; None: all of its scenes.
-    """
+    """Divide a global batch evenly; a process holds up to `micro_batch` of its scenes at a time."""
     scenes, remainder = divmod(batch_size, processes)
     if remainder:
         fewer = largest_divisor(batch_size, processes)
@@ -70,8 +65,5 @@ def batches_done(trainer: lightning.Trainer) -> int:
 
 
 def ignore_first_sigterm(_: int) -> None:
-    """Ignore the first SIGTERM, which a scheduler also sends to the loaders of a run that saves.
-
-    The second one ends the process.
-    """
+    """Ignore the first SIGTERM, which a scheduler also sends to the loaders of a run that saves."""
     signal.signal(signal.SIGTERM, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL))

@@ -15,15 +15,10 @@ from asysplat.scene import Cameras, Gaussians, TensorRecord, Views
 
 @dataclass(frozen=True)
 class Normalization(TensorRecord):
-    """The transform from the data set's world to the network's frame, and its inverse.
+    """The transform from the data set's world to the network's frame, and its inverse."""
 
-    Args:
-        world_to_mean: rigid, float64, from the data set's world to the mean input camera.
-        scale: factor of all lengths, applied afterwards.
-    """
-
-    world_to_mean: Float[Tensor, "4 4"]
-    scale: float
+    world_to_mean: Float[Tensor, "4 4"]  # rigid, float64, to the mean input camera
+    scale: float  # factor of all lengths, applied afterwards
 
     def apply(self, views: Views) -> Views:
         """Transform views, with their depths, from the data set's world to the network's frame."""
@@ -55,11 +50,8 @@ def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalizatio
     """Move the world's origin to the mean input camera and scale the farthest input to distance 1.
 
     The mean pose has the mean of the centers and the mean of the forward and down axes, made
-    orthonormal by Gram-Schmidt (as Long-LRM, arXiv 2410.12781). One scene, without batch dimension.
-
-    Returns:
-        inputs and targets in the network's frame, and the transform; its scale is 1 if all inputs
-        have the same position.
+    orthonormal by Gram-Schmidt (as Long-LRM, arXiv 2410.12781). Of inputs in one place the scale
+    is 1. One scene, without batch dimension.
     """
     poses = to_float64(inputs.cameras.cam_to_world)
     centers = poses[:, :3, 3]
@@ -90,9 +82,6 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
 
     A point counts as occluded if it is much deeper than another point in a window around it, since
     sparse points of a surface leave gaps. The sparser the points, the larger the window.
-
-    Args:
-        points: in the world of the cameras.
     """
     exact_points, exact = torch.as_tensor(points, dtype=torch.float64), cameras.to(torch.float64)
     inverse = torch.zeros(cameras.num_views, cameras.height, cameras.width)

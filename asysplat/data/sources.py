@@ -56,14 +56,7 @@ class Source(Protocol):
 class ProceduralSource:
     """Synthetic scenes: unlimited ones to train, and fixed ones to validate and test.
 
-    Splits share no seeds.
-
-    Args:
-        window: least and greatest number of consecutive images that a training task is drawn from;
-            None: all images.
-        first_window: window of the first task; None: `window`.
-        val_scenes, test_scenes: number of scenes of each split.
-        varied: whether training scenes are varied; see ProceduralScene.
+    Splits share no seeds. See FilesSource for the windows.
     """
 
     height: int
@@ -73,7 +66,7 @@ class ProceduralSource:
     val_scenes: int
     test_scenes: int
     places: str = "both"
-    varied: bool = False
+    varied: bool = False  # in training; see ProceduralScene
     first_window: Sequence[int] | None = None
 
     def training(
@@ -84,7 +77,6 @@ class ProceduralSource:
         return Task(scene, training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
-        """See Source."""
         selection = uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
         return [Task(self._scene(split, index), selection) for index in range(count)]
@@ -95,10 +87,7 @@ class ProceduralSource:
 
 
 class SceneFolder:
-    """The scenes that a folder is or holds, each opened at its first use.
-
-    The MAX_OPEN last used stay open.
-    """
+    """The scenes that a folder is or holds, of which the MAX_OPEN last used stay open."""
 
     def __init__(self, root: str, options: SceneOptions):
         self.root = Path(root).absolute()
@@ -196,14 +185,9 @@ class FilesSource:
         sequence = self.training_folder[scenes[rng.integers(len(scenes))]]
         count = sequence.num_images
         images = range(count) if self.split_by_scenes else training_images(count)
-        drawn = training_selection(
-            len(images),
-            inputs,
-            targets,
-            grown_window(self.first_window, self.window, grown),
-            rng,
-            self.targets_may_be_inputs,
-        )
+        window = grown_window(self.first_window, self.window, grown)
+        both = self.targets_may_be_inputs
+        drawn = training_selection(len(images), inputs, targets, window, rng, both)
         chosen = Selection([images[i] for i in drawn.inputs], [images[i] for i in drawn.targets])
         return Task(sequence, chosen)
 
@@ -223,8 +207,7 @@ class FilesSource:
         if scenes is None:
             return list(folder)
         named = [folder.folders(index) & {*scenes} for index in range(len(folder))]
-        missing = {*scenes} - set().union(*named)
-        if missing:
+        if missing := {*scenes} - set().union(*named):
             raise InputError(
                 f"scenes names {min(missing)}, and {folder.root} has no such folder: choose of "
                 f"{', '.join(path.name for path in folder.paths)}."
@@ -246,20 +229,16 @@ class FilesSource:
     def _index_tasks(self, file: str, inputs: int) -> list[Task]:
         index = read_index(file, inputs)
         tasks = [
-            Task(
-                sequence,
-                select_from_index(index, file, sequence.name, sequence.num_images, inputs),
-            )
-            for sequence in self._tests
-            if sequence.name in index
+            Task(scene, select_from_index(index, file, scene.name, scene.num_images, inputs))
+            for scene in self._tests
+            if scene.name in index
         ]
         if not tasks:
             raise InputError(
                 f"data.index={file} names none of the scenes of {self.test_folder.root}, "
                 f"such as {self._tests[0].name}: give the index of this data set."
             )
-        missing = set(index) - {task.sequence.name for task in tasks}
-        if missing:
+        if missing := set(index) - {task.sequence.name for task in tasks}:
             raise InputError(
                 f"data.index={file} names {len(missing)} scenes that do not exist, such as "
                 f"{min(missing)}: add them, or write an index of the scenes that you have with "
@@ -271,8 +250,8 @@ class FilesSource:
 def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
     """Choose the further test sets of a configuration that a run tests.
 
-    A set without a root of its own is always tested. One with a root is tested only by data on
-    disk, if the root is given and the set has another name than the data.
+    One with a root of its own is tested only by data on disk, if the root is given and the set has
+    another name than the data.
     """
     return {
         test_set: options

@@ -19,8 +19,7 @@ MAX_STEP = 2**16 - 1  # largest depth in a 16-bit image
 def write_transforms(views: Views, folder: Path) -> None:
     """Write one scene: transforms.json, images/NNNNN.png, and depth/NNNNN.png where known.
 
-    Cameras as in `describe_cameras`. Depths are 16-bit PNG of thousandths of a scene unit along the
-    camera's z axis, 0 where unknown.
+    Depths are 16-bit PNG of thousandths of a scene unit along z, 0 where unknown.
     """
     if views.images.ndim != 4:
         raise InputError(
@@ -51,9 +50,8 @@ def write_transforms(views: Views, folder: Path) -> None:
 def describe_cameras(cameras: Cameras, files: Sequence[str]) -> dict[str, Any]:
     """Describe cameras, [V], and their image files as in a transforms.json.
 
-    Matrices are camera-to-world with OpenGL axes (x right, y up, z backward). cx and cy are in
-    pixels with the first pixel's center at +0.5, as in `Cameras`. Format:
-    https://docs.nerf.studio/quickstart/data_conventions.html
+    With OpenGL axes (x right, y up, z backward). Pixels are those of `Cameras`, as in nerfstudio.
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html
     """
     frames = []
     poses = cameras.cam_to_world * cameras.cam_to_world.new_tensor([1, -1, -1, 1])

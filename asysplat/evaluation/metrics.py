@@ -44,10 +44,7 @@ def psnr(rendered: Images, target: Images) -> PerView:
 
 
 def ssim(
-    rendered: Images,
-    target: Images,
-    window: Window = "gaussian",
-    covariance: Covariance = "biased",
+    rendered: Images, target: Images, window: Window = "gaussian", covariance: Covariance = "biased"
 ) -> PerView:
     """Compute the SSIM of each image in [0, 1] (Wang et al. 2004), mean over the channels.
 

@@ -27,11 +27,8 @@ def free_radii(
 ) -> Float[ndarray, " T"]:
     """Compute the radii of a closed path that smoothly evades walls, `radius` where it meets none.
 
-    A wall is the first that a look outward meets with half of the opacity, in any pixel.
-
-    Args:
-        outward: cam_to_world of each frame's look, from a point in free space.
-        starts: radii of these points, `radius` at most.
+    A wall is the first that a look `outward` (cam_to_world) meets with half of the opacity, in any
+    pixel. The looks are from points of free space, whose radii are `starts`.
     """
     # Here, as it would slow down import asysplat.
     from scipy.ndimage import minimum_filter1d, uniform_filter1d
@@ -100,11 +97,9 @@ def smoothed_path(cameras: Cameras, frames: int, as_given: bool = False) -> Came
 
 
 def _short_order(vectors: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
-    """Choose the original order, or that of nearest neighbors if it is far shorter.
-
-    The latter starts with the view farthest from the mean, an end of the path.
-    """
+    """Choose the original order, or that of nearest neighbors if it is far shorter."""
     original = np.arange(len(vectors))
+    # It starts with the view farthest from the mean, an end of the path.
     order = [int(_lengths(vectors - vectors.mean(0)).argmax())]
     remaining = np.delete(original, order[0])
     while len(remaining):
@@ -190,21 +185,15 @@ def orbit(
     center = focus + heights.mean() * up
     radii = np.full(frames, radius)
     if gaussians is not None:
-        # Space is free at the input cameras.
-        starts = _nearest(_lengths(flat), azimuths, angles).clip(lowest, radius)
+        # Space is free at the input cameras: a look starts as far out as the nearest of those in
+        # about its direction.
+        apart = np.abs((angles[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi)
+        alike = apart <= apart.min(1, keepdims=True) + SAME_DIRECTION
+        starts = np.where(alike, _lengths(flat), np.inf).min(1).clip(lowest, radius)
         outward = _looks(center + starts[:, None] * circle, circle, up)
         radii = free_radii(gaussians, outward, starts, radius)
     centers = center + radii[:, None] * circle
-    path = _looks(centers, focus - centers, up)
-    return _with_poses(cameras, path)
-
-
-def _nearest(
-    distances: Float[ndarray, " V"], azimuths: Float[ndarray, " V"], angles: Float[ndarray, " T"]
-) -> Float[ndarray, " T"]:
-    apart = np.abs((angles[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi)
-    alike = apart <= apart.min(1, keepdims=True) + SAME_DIRECTION
-    return np.where(alike, distances, np.inf).min(1)
+    return _with_poses(cameras, _looks(centers, focus - centers, up))
 
 
 def _looks(
@@ -220,10 +209,9 @@ def _looks(
 
 
 def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
-    """Return the world's up direction.
+    """Return what is perpendicular to all x axes, as photographers keep the horizon level.
 
-    Photographers keep the horizon level, so that up is perpendicular to all cameras' x axes. If
-    these are parallel, up is the cameras' mean up.
+    If these are parallel, return the cameras' mean up.
     """
     right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
     if np.linalg.norm(up) < ROUNDING:  # they cancel
@@ -235,10 +223,9 @@ def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
 
 
 def _focus(poses: Float[ndarray, "V 4 4"], cameras: Cameras, middle: int) -> Float[ndarray, "3"]:
-    """Return the point nearest to all optical axes, if it is visible in most views.
+    """Return the point nearest to all optical axes, or one in front of the middle camera.
 
-    Otherwise (axes nearly parallel, or meeting at or behind the cameras) return a point in front of
-    the middle camera.
+    The latter if the axes are nearly parallel, or their point is not visible in most views.
     """
     centers, axes, size = poses[:, :3, 3], poses[:, :3, 2], _spread(poses)
     if size:

@@ -67,9 +67,7 @@ WRITERS = {
 
 
 def read_gaussians(
-    path: str | Path,
-    origin: Sequence[float] | None = None,
-    dtype: torch.dtype = torch.float32,
+    path: str | Path, origin: Sequence[float] | None = None, dtype: torch.dtype = torch.float32
 ) -> Gaussians:
     """Read a scene from a .ply, .spz, .sog, .glb, .splat or .safetensors file.
 
@@ -109,10 +107,9 @@ def read_notes(path: Path) -> Notes:
             antialiased = spz.is_antialiased(path)
         case ".sog":
             antialiased = sog.is_antialiased(path)
-    numbers = {name: _numbers(texts.get(name, "")) for name in ("offset", "background")}
     return Notes(
-        offset=numbers["offset"] or NO_NOTES.offset,
-        background=numbers["background"],
+        offset=_numbers(texts.get("offset", "")) or NO_NOTES.offset,
+        background=_numbers(texts.get("background", "")),
         antialiased=antialiased or texts.get("antialiased", "").strip() == "1",
     )
 

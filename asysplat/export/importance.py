@@ -17,9 +17,6 @@ def blending_weights(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "N
     """Compute the sum of each Gaussian's blending weights over all pixels of all views.
 
     An image is linear in the Gaussians' colors, with these weights as its gradient.
-
-    Args:
-        cameras: [V]; views are rendered one by one.
     """
     gray = torch.zeros_like(gaussians.sh[:, :1], requires_grad=True)
     with torch.enable_grad():
@@ -35,8 +32,7 @@ def most_important(gaussians: Gaussians, fraction: float, cameras: Cameras | Non
     Without cameras, opacity times area stands for the weight.
     """
     if cameras is None:
-        largest_two = gaussians.scales.sort(-1).values[:, 1:]
-        weights = gaussians.opacities * largest_two.prod(-1)
+        weights = gaussians.opacities * gaussians.scales.sort(-1).values[:, 1:].prod(-1)
     else:
         weights = blending_weights(gaussians, cameras)
     count = max(1, round(fraction * gaussians.num_gaussians))

@@ -99,13 +99,10 @@ class SceneFile:
 def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, SceneFile]:
     """Find the file of every scene of the data, by the scene's name.
 
-    Args:
-        scenes: a folder with a file for each scene, named as the scene; or the file of the only
-            scene, under any name.
+    `scenes` is a folder with a file for each, named as the scene; or the file of the only scene.
     """
     option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
-    kinds = f"{', '.join(READERS)}"
-    listed = list_names(data)
+    kinds, listed = ", ".join(READERS), list_names(data)
     if scenes.is_file():
         if len(data) != 1:
             raise InputError(
@@ -131,8 +128,7 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
                 f"{listed}."
             )
         paths[path.stem] = path
-    missing = sorted(data.keys() - paths.keys())
-    if missing:
+    if missing := sorted(data.keys() - paths.keys()):
         raise InputError(
             f"{option} has no file of {len(missing)} of the {len(data)} scenes, "
             f"{', '.join(missing)}: add them ({kinds}), or leave these scenes out of the data."
@@ -141,12 +137,7 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
 
 
 def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitted: bool) -> None:
-    """Check that at least half of the views show Gaussians.
-
-    Args:
-        gaussians, cameras: in one frame.
-        fitted: whether they were moved there by the file's cameras.
-    """
+    """Check that at least half of the views show Gaussians; `fitted`: by the file's cameras."""
     with torch.no_grad():
         views = cameras.resized(COVERAGE_SIZE, COVERAGE_SIZE)
         alpha = render(gaussians, views, depth=False).alpha
@@ -178,8 +169,7 @@ def _unique(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
 def _points(poses: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "P 3"], float]:
     """Return each camera's center and a point on each of its axes, and the spread of the centers.
 
-    The points are as far from the centers as these are from their mean, by root mean square. So two
-    cameras determine a similarity, and cameras on a line, too.
+    The points are as far away as the spread: so two cameras, or a line of them, fix a similarity.
     """
     centers = poses[:, :3, 3]
     spread = (centers - centers.mean(0)).square().sum(-1).mean().sqrt().item()

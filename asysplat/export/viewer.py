@@ -69,13 +69,12 @@ class Viewer:
     """Show Gaussians in the browser, among the input cameras and images.
 
     Each page that opens `url` has its own camera; the panel's settings hold for all pages. A click
-    on a camera moves the page's camera there. Scenes may have any size.
+    on a camera moves the page's camera there.
 
     Args:
         views: input views, [V]; of images of one pixel, frames alone are drawn.
         gaussians: [N]; None to `show` them later.
-        port: port of this machine; the next free one is used if it is taken; 0: any free one.
-        antialiased: see `render`; the panel changes it.
+        port: the next free one is used if it is taken; 0: any free one.
     """
 
     def __init__(
@@ -119,10 +118,7 @@ class Viewer:
         return f"http://127.0.0.1:{self._server.get_port()}"
 
     def show(self, gaussians: Gaussians, text: str = "") -> None:
-        """Show other Gaussians, [N], and Markdown in the panel; any thread may call it.
-
-        Returns at once.
-        """
+        """Show other Gaussians, [N], and Markdown in the panel, at once; any thread may call it."""
         _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
         # Copied, as kernels run without bounds checks: their inputs must not change meanwhile.
         with torch.no_grad():
@@ -214,9 +210,8 @@ class Viewer:
         if gaussians is not None:
             distance = (gaussians.means.cpu() - position).norm(dim=-1).median()
         up = self._up - (self._up @ right) * right
-        vectors = (position, position + distance * forward, up)
         fov, _ = viewer_cameras.field_of_view(self._cameras, view)
-        return *(vector.numpy() for vector in vectors), fov
+        return position.numpy(), (position + distance * forward).numpy(), up.numpy(), fov
 
     def _change(self) -> None:
         self._version = object()
@@ -250,7 +245,6 @@ class Viewer:
             return True
         try:
             camera, in_full = viewer_cameras.client_camera(client.camera, max_pixels)
-            camera = camera.to(gaussians.means.device)
             image = draw_layer(gaussians, camera, **self._options())
             if client.client_id not in self._server.get_clients():  # closed meanwhile
                 return True
@@ -259,16 +253,16 @@ class Viewer:
         except Exception as error:  # nothing reads this thread's errors but the panel
             self._text.content = f"**{type(error).__name__}:** {error}"
             return True
-        size = f"{gaussians.num_gaussians:,} Gaussians, {camera.width} x {camera.height} pixels"
-        milliseconds = 1000 * (time.perf_counter() - start)
-        self._text.content = f"{size} in {milliseconds:.0f} ms\n\n{text}"
+        self._text.content = (
+            f"{gaussians.num_gaussians:,} Gaussians, {camera.width} x {camera.height} pixels in "
+            f"{1000 * (time.perf_counter() - start):.0f} ms\n\n{text}"
+        )
         return in_full
 
     def _options(self) -> dict[str, Any]:
         """Return the panel's options of `draw_layer`, valid whatever a page has sent."""
-        layer = self._layer.value
         return {
-            "layer": layer if layer in LAYERS else LAYERS[0],
+            "layer": self._layer.value if self._layer.value in LAYERS else LAYERS[0],
             "sh_degree": round(_bounded(self._sh_degree)),
             "min_opacity": _bounded(self._min_opacity),
             "size": _bounded(self._size),
@@ -300,20 +294,11 @@ def draw_layer(
     size: float = 1.0,
     antialiased: bool = False,
 ) -> UInt8[ndarray, "H W 3"]:
-    """Render one layer of a scene, as colors.
-
-    Args:
-        layer: "color", "alpha", or "depth": disparities, the nearest bright.
-        size: factor of the scales, > 0.
-        antialiased: see `render`.
-    """
-    opacities = gaussians.opacities
-    opacities = opacities.where(opacities >= min_opacity, 0)
+    """Render one of LAYERS as colors, depths as disparities; `size` is a factor of the scales."""
+    opacities = gaussians.opacities.where(gaussians.opacities >= min_opacity, 0)
     gaussians = replace(gaussians, scales=size * gaussians.scales, opacities=opacities)
-    options = {"sh_degree": sh_degree, "antialiased": antialiased}
-    rendering = render(
-        gaussians, camera.to(gaussians.means.device), depth=layer == "depth", **options
-    )
+    options = {"sh_degree": sh_degree, "antialiased": antialiased, "depth": layer == "depth"}
+    rendering = render(gaussians, camera.to(gaussians.means.device), **options)
     if layer == "depth":
         values = inverse_depths(rendering.depth[0])
         sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]

@@ -1,7 +1,7 @@
 """Cameras of the viewer: of its clients, and of the frustums that they see."""
 
 import math
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,17 +14,6 @@ from asysplat.scene import MAX_FIELD_OF_VIEW, Cameras
 
 MAX_SIDE = 16384  # pixels of a client's image
 MIN_FOV, MAX_FOV = 1e-3, 2.9  # radians
-
-
-@runtime_checkable
-class PageCamera(Protocol):
-    """The camera of a page, such as viser's CameraHandle; `fov` is vertical, in radians."""
-
-    wxyz: ndarray
-    position: ndarray
-    fov: float
-    image_height: int
-    image_width: int
 
 
 def mean_up(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -62,8 +51,8 @@ def clicked_camera(
     return steps.where(hit, torch.inf).argmin().item() if hit.any() else None
 
 
-def client_camera(client: PageCamera, max_pixels: int) -> tuple[Cameras, bool]:
-    """Return the camera of a page, and whether it has all pixels of its window."""
+def client_camera(client: Any, max_pixels: int) -> tuple[Cameras, bool]:
+    """Return the camera of a page, viser's CameraHandle, and whether it has all pixels of it."""
     height, width = (
         min(max(side, 1), MAX_SIDE) for side in (client.image_height, client.image_width)
     )

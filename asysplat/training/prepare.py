@@ -35,12 +35,7 @@ from asysplat.runs.checkpoints import (
 from asysplat.runs.machine import find_accelerator, revision
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import RESULTS, describe_run
-from asysplat.runs.stages import (
-    check_stages,
-    describe_stage,
-    resume_point,
-    stage_configs,
-)
+from asysplat.runs.stages import check_stages, describe_stage, resume_point, stage_configs
 from asysplat.runs.summary import Results, print_summary, write_json
 from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO, StageRecord
 from asysplat.training.loggers import log_choices, log_results, quiet_lightning

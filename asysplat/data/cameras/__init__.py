@@ -23,19 +23,13 @@ LEAST_FEATURES = 0.25
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Which cameras of photographs are used.
+    """Which cameras of photographs are used."""
 
-    Args:
-        choice: which cameras: "given" with the photographs; "refined" from those; "found" by
-            structure from motion, as always where none are given; or "auto": refined where that
-            lowers the reprojection error by a hundredth, else given.
-        where: folder of found and refined cameras.
-        frames: greatest number of frames of a video.
-    """
-
+    # "given" with the photographs; "refined" from those; "found" by structure from motion, as
+    # always where none are given; "auto": refined if that lowers the error by LEAST_GAIN.
     choice: str = "given"
-    where: Path = Path("logs/cameras")
-    frames: int = 100
+    where: Path = Path("logs/cameras")  # folder of found and refined cameras
+    frames: int = 100  # greatest number, of a video
     console: Console | None = None
 
     def __post_init__(self):

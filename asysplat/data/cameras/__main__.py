@@ -24,13 +24,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
-        folder = find_cameras(
-            options.path, options.out, options.frames, options.on_error, make_console()
-        )
+        chosen = (options.path, options.out, options.frames, options.on_error)
+        print(find_cameras(*chosen, make_console()))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(folder)
     return 0
 
 

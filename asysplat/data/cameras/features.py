@@ -20,21 +20,13 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Effort:
-    """How hard features and matches are sought.
+    """How hard features and matches are sought."""
 
-    Args:
-        max_side: pixels of the longer side; larger images are shrunk to find features.
-        features: greatest number of features in an image.
-        contrast: least contrast of a feature.
-        guided: whether matches are sought again along epipolar lines.
-        pair: least number of inliers of a pair.
-    """
-
-    max_side: int
-    features: int
-    contrast: float
-    guided: bool
-    pair: int
+    max_side: int  # pixels of the longer side; larger images are shrunk to find features
+    features: int  # greatest number in an image
+    contrast: float  # least of a feature
+    guided: bool  # whether matches are sought again along epipolar lines
+    pair: int  # least number of inliers of a pair
 
 
 USUAL = Effort(1600, 4096, 0.0067, guided=False, pair=15)
@@ -48,13 +40,11 @@ def match_photographs(
     progress: Progress,
     cameras: Mapping[AnyLens, pycolmap.Camera] | None = None,
 ) -> Path:
-    """Write a database of features and verified matches; return its path.
+    """Write a database of features and verified matches of work/images; return its path.
 
     Args:
-        work: folder whose images/ has the photographs and whose masks/ may have NAME.png, 0 where
-            features are not wanted.
-        lenses: lens by the name of each photograph, in the order of the sequence; photographs of
-            the same lens have one camera.
+        work: its masks/ may have NAME.png, 0 where features are not wanted.
+        lenses: by photograph, in the order of the sequence; those of the same lens have one camera.
         cameras: camera of each lens, where lenses are known; else a focal length is guessed.
     """
     database = work / f"{effort.features}.db"
@@ -68,13 +58,9 @@ def match_photographs(
             options.camera_model = cameras[lens].model_name
             options.camera_params = cameras[lens].params_to_string()
         # In order: otherwise threads number the images, and no two runs are alike.
-        pycolmap.import_images(
-            database,
-            work / "images",
-            pycolmap.CameraMode.SINGLE,
-            [name for name in lenses if lenses[name] == lens],
-            options,
-        )
+        names = [name for name in lenses if lenses[name] == lens]
+        single = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(database, work / "images", single, names, options)
     task = progress.add_task("features", total=len(lenses))
     options = pycolmap.ImageReaderOptions()
     if (work / "masks").is_dir():

@@ -39,18 +39,12 @@ LEAST_PHOTOGRAPHS = 3
 
 @dataclass(frozen=True)
 class Attempt:
-    """How hard cameras are sought.
-
-    Args:
-        first_pair, image: least number of inliers of the pair to start with, and of an image that
-            is added.
-        angle: least angle between the rays of the pair to start with, in degrees.
-    """
+    """How hard cameras are sought."""
 
     effort: Effort
-    first_pair: int
-    image: int
-    angle: float
+    first_pair: int  # least number of inliers of the pair to start with
+    image: int  # and of an image that is added
+    angle: float  # least angle between the rays of the pair to start with, in degrees
 
 
 ATTEMPTS = (Attempt(USUAL, 100, 30, 16.0), Attempt(HARD, 50, 15, 4.0))
@@ -66,10 +60,9 @@ def find_cameras(
     """Find the cameras of photographs or of a video; return a folder in COLMAP's layout.
 
     Its images/ are links to the photographs, upright copies of those that are stored turned, or the
-    frames of a video; its masks/ are theirs, if there are any, and what they leave out is not
-    matched; its sparse/0 has the cameras and the points they were found with. A second attempt with
-    weaker features follows where the first finds fewer than 9 of 10 cameras; the better one is
-    returned.
+    frames of a video; its masks/ are theirs, and what they leave out is not matched; its sparse/0
+    has the cameras and points. A second attempt with weaker features follows where the first finds
+    fewer than 9 of 10 cameras; the better one is returned.
 
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
@@ -98,7 +91,11 @@ def find_cameras(
             mask = masks.get(file)
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
-        model = _best_model(work, kinds, progress)
+        model = None
+        for attempt in ATTEMPTS:
+            model = max(model, _reconstruct(work, kinds, attempt, progress), key=_registered)
+            if _registered(model) >= ENOUGH * len(kinds):
+                break
         if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
@@ -149,19 +146,6 @@ def _registered(model: pycolmap.Reconstruction | None) -> int:
     return 0 if model is None else model.num_reg_images()
 
 
-def _best_model(
-    work: Path, lenses: dict[str, tuple], progress: Progress
-) -> pycolmap.Reconstruction | None:
-    """Return the largest model of the attempts, which end with the first that is large enough."""
-    best = None
-    for attempt in ATTEMPTS:
-        model = _reconstruct(work, lenses, attempt, progress)
-        best = max(best, model, key=_registered)
-        if _registered(best) >= ENOUGH * len(lenses):
-            break
-    return best
-
-
 def _reconstruct(
     work: Path, lenses: dict[str, tuple], attempt: Attempt, progress: Progress
 ) -> pycolmap.Reconstruction | None:
@@ -175,10 +159,6 @@ def _reconstruct(
     options.mapper.init_min_tri_angle = attempt.angle
     options.mapper.abs_pose_min_num_inliers = attempt.image
     models = pycolmap.incremental_mapping(
-        database,
-        work / "images",
-        work,
-        options,
-        next_image_callback=lambda: progress.advance(task),
+        database, work / "images", work, options, next_image_callback=lambda: progress.advance(task)
     )
     return max(models.values(), key=_registered, default=None)

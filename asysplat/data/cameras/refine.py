@@ -38,20 +38,13 @@ LEAST_OF_LENS = 10  # photographs of a lens, for its focal length and distortion
 
 @dataclass(frozen=True)
 class RefinedCameras:
-    """Refined cameras, and how well they and the original ones fit the same points.
+    """Refined cameras, and how well they and the original ones fit the same points."""
 
-    Args:
-        scene: scene with the refined cameras.
-        before, after: mean distances of the points' projections from their features, in pixels.
-        features: number of these features; with none the cameras are as they were.
-        matched: number of matches between photographs, which no camera has a part in.
-    """
-
-    scene: PosedScene
-    before: float
+    scene: PosedScene  # with the refined cameras
+    before: float  # mean distance of the points' projections from their features, in pixels
     after: float
-    features: int
-    matched: int
+    features: int  # number of these features; with none the cameras are as they were
+    matched: int  # number of matches between photographs, which no camera has a part in
 
 
 def refine_cameras(
@@ -59,13 +52,9 @@ def refine_cameras(
 ) -> RefinedCameras:
     """Refine poses of a scene's photographs, and focal lengths and distortions of their lenses.
 
-    A lens of fewer than 10 photographs stays as it is. The result is moved back by a similarity, so
-    that it stays in the given world at the given scale; photographs that see few of the points keep
-    their poses. It is written to a folder in COLMAP's layout, and the next call with the same
-    photographs and cameras reads it there.
-
-    Args:
-        scene: scene whose images are files, each once.
+    A lens of fewer than 10 photographs stays as it is. The result is moved back by a similarity to
+    the given world and scale; photographs that see few of the points keep their poses. It is
+    written to a folder in COLMAP's layout, where the next call with the same input reads it.
     """
     where = Path(where).absolute()
     images = {image.file: image for image in scene.images if isinstance(image.file, Path)}
@@ -87,12 +76,8 @@ def refine_cameras(
         return RefinedCameras(scene, **errors)
     refined_scene = colmap.read_scene(folder, BadImages())
     refined = {image.file.name: image for image in refined_scene.images}
-    changed = []
-    for file, image in images.items():
-        refined_image = refined[names[file]]
-        changed.append(
-            replace(image, lens=refined_image.lens, cam_to_world=refined_image.cam_to_world)
-        )
+    pairs = [(image, refined[names[file]]) for file, image in images.items()]
+    changed = [replace(old, lens=new.lens, cam_to_world=new.cam_to_world) for old, new in pairs]
 
     def read_points() -> Points | None:
         points = refined_scene.points

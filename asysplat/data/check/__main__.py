@@ -63,12 +63,11 @@ def check(options: Namespace, console: Console) -> int:
     """Check up to MAX_SCENES scenes, and return 0 if the cameras of all fit, else 1."""
     layout, scenes = find_scenes(options.path, options.layout)
     refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
-    checked = scenes[:MAX_SCENES]
-    if len(scenes) > len(checked):
-        more = f"checking {len(checked)} of {len(scenes)} scenes; name one of them to check another"
+    if len(scenes) > MAX_SCENES:
+        more = f"checking {MAX_SCENES} of {len(scenes)} scenes; name one of them to check another"
         console.print(more, highlight=False)
     all_fit = True
-    for path in checked:
+    for path in scenes[:MAX_SCENES]:
         bad = BadImages(options.on_error)
         scene = read_scene(layout, path, bad)
         with warnings.catch_warnings():

@@ -33,15 +33,10 @@ Keypoints = tuple[Float32[ndarray, "_ 2"], Float32[ndarray, "_ 128"]]
 
 @dataclass(frozen=True)
 class Matches:
-    """Points matched between two images, one pair of images after the other.
+    """Points matched between two images, one pair of images after the other."""
 
-    Args:
-        indices: indices of the two images of each match.
-        points: x, y in both images, in pixels, the first pixel's center at +0.5.
-    """
-
-    indices: Int[Tensor, "M 2"]
-    points: Float[Tensor, "M 2 2"]
+    indices: Int[Tensor, "M 2"]  # of the two images
+    points: Float[Tensor, "M 2 2"]  # x, y in both, in pixels, the first pixel's center at +0.5
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -58,24 +53,22 @@ def find_matches(sequence: ImageSequence, console: Console | None = None) -> Mat
     """Match up to MAX_PAIRS pairs of images, spread evenly over the sequence.
 
     The gap between the images of a pair doubles while enough points match, and halves while too few
-    match. Pairs without parallax do not constrain the camera's position: they are dropped if they
-    are the minority.
+    do. Pairs without parallax, if the minority, are dropped: they do not constrain positions.
     """
     keypoints = cache(partial(_detect, sequence))
 
     def match_with_gap(first: int, gap: int) -> Matches:
         second = first + gap if first + gap < sequence.num_images else first - gap
-        points = np.empty((0, 2, 2))
-        if second >= 0:
-            points = _match(keypoints(first), keypoints(second))
+        found = second >= 0
+        points = _match(keypoints(first), keypoints(second)) if found else np.empty((0, 2, 2))
         return Matches(torch.tensor([[first, second]]).repeat(len(points), 1), torch.tensor(points))
 
     gap, pairs = FIRST_GAP, []
     starts = np.linspace(0, sequence.num_images - 1, MAX_PAIRS, endpoint=False).astype(int)
-    bar = track(
-        starts.tolist(), "matching", console=console, transient=True, disable=console is None
-    )
-    for first in bar:
+    hidden = console is None
+    for first in track(
+        starts.tolist(), "matching", console=console, transient=True, disable=hidden
+    ):
         pair = match_with_gap(first, gap)
         while len(pair) < MIN_MATCHES and gap > 1:
             gap //= 2
@@ -147,9 +140,7 @@ def _match(first: Keypoints, second: Keypoints) -> Float[ndarray, "M 2 2"]:
 def epipolar_lines(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]:
     """Compute the epipolar line in each view of each match, from the point in the other view.
 
-    Returns:
-        a, b, c of each line: a x + b y + c is the distance of (x, y) in pixels. NaN where both
-        cameras have the same position.
+    Of its a, b, c, a x + b y + c is the distance of (x, y) in pixels; NaN of cameras in one place.
     """
     rotations = cameras.cam_to_world[..., :3, :3]
     # The plane through a ray of one view and the center of the other is a line in the other view.
@@ -162,10 +153,7 @@ def epipolar_lines(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]
 
 
 def epipolar_distances(cameras: Cameras, matches: Matches) -> Float[Tensor, " M"]:
-    """Compute the distance in pixels from points to epipolar lines, the mean of both views.
-
-    Infinite where both cameras have the same position.
-    """
+    """Compute the mean distance of both points to their lines; inf of cameras in one place."""
     lines = epipolar_lines(cameras, matches)
     residuals = (lines[..., :2] * matches.points).sum(-1) + lines[..., 2]
     return residuals.abs().mean(-1).nan_to_num(nan=torch.inf)
@@ -176,9 +164,7 @@ def triangulate(
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, " M"]]:
     """Triangulate each match at the nearest points of its two rays.
 
-    Returns:
-        Depths along the z axes of both cameras, in scene units, and the angle between the rays, in
-        degrees.
+    Returns the depths along both cameras' z axes, and the angle between the rays, in degrees.
     """
     baseline = _baseline(cameras, matches)
     # Normal equations of |x first - y second - baseline|.

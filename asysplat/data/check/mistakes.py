@@ -31,15 +31,11 @@ Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Mistake:
-    """One way in which cameras may be wrong.
-
-    Args:
-        correct: computes the correct cameras from the cameras as read.
-    """
+    """One way in which cameras may be wrong."""
 
     name: str
     fix: str
-    correct: Callable[[Cameras], Cameras]
+    correct: Callable[[Cameras], Cameras]  # from the cameras as read
 
 
 def common_mistakes(names: Sequence[str]) -> list[Mistake]:
@@ -54,9 +50,7 @@ def common_mistakes(names: Sequence[str]) -> list[Mistake]:
         "fx and fy": lambda focal, center: (focal.flip(-1), center),
         "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
     }
-    lenses = [
-        _lens_mistake(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged
-    ]
+    lenses = [_lens_mistake(f"{n} are exchanged", exchange, exchanged[n]) for n in exchanged]
     axes = _swapped_axes()
     inverse = _pose_mistake(
         "world-to-camera matrices were taken for camera-to-world",
@@ -110,8 +104,7 @@ def other_focal(factor: float) -> Mistake:
 def _swapped_axes() -> list[Mistake]:
     """List all other orders and signs of the three axes.
 
-    A change that mirrors the axes mirrors the world too: otherwise the matrix would not be a
-    rotation, and the reader would have refused it.
+    What mirrors the axes mirrors the world: the reader would have refused what is no rotation.
     """
     mistakes = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):

@@ -3,17 +3,18 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 
 import numpy as np
 import torch
 from rich.console import Console
+from rich.progress import track
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
-from asysplat.data.check.measurements import compare_depths, read_pixels
 from asysplat.data.check.mistakes import Mistake, common_mistakes, other_focal, other_resolution
 from asysplat.data.images import content_hash
-from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
+from asysplat.data.sequence import FileSequence, ImageSequence, PosedScene, SceneOptions
 from asysplat.scene import Cameras
 
 MAX_SIDE = 960  # pixels: longer side of the images in which points are matched
@@ -29,6 +30,8 @@ TRIALS = 41  # factors tried, coarsely and then finely
 FIT_STRIDE = 3  # one match in so many is used to fit them
 MAX_LENSES = 3  # printed, the most common ones
 DEPTH_AGREEMENT = (0.8, 1.25)  # median of depth maps over triangulated depths without advice
+# Of a match whose depth is compared: pixels, and degrees between its rays.
+MAX_EPIPOLAR_ERROR, MIN_DEPTH_ANGLE = 1.0, 1.5
 
 NO_MISTAKE_FOUND = (
     "the cameras do not fit the images, and no usual mistake explains it: check in check.png "
@@ -42,17 +45,11 @@ ROUGH_FIT = (
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of cameras with matches.
+    """Agreement of cameras with matches."""
 
-    Args:
-        error: median distance to the epipolar lines, in pixels.
-        under_1px: fraction of the matches with a distance below 1 pixel.
-        behind_camera: fraction of the triangulated points behind a camera.
-    """
-
-    error: float
-    under_1px: float
-    behind_camera: float
+    error: float  # median distance to the epipolar lines, in pixels
+    under_1px: float  # fraction of the matches with a distance below 1 pixel
+    behind_camera: float  # fraction of the triangulated points behind a camera
 
     @property
     def penalty(self) -> float:
@@ -62,17 +59,11 @@ class Fit:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The diagnosis of a scene's cameras.
+    """The diagnosis of a scene's cameras."""
 
-    Args:
-        fits: whether the cameras as read fit the images.
-        summary: the same in words; if they do not fit, the reason and what to do.
-        fit: fit of the cameras as read; None with too few matches.
-    """
-
-    fits: bool
-    summary: str
-    fit: Fit | None = None
+    fits: bool  # whether the cameras as read fit the images
+    summary: str  # the same in words; if they do not fit, the reason and what to do
+    fit: Fit | None = None  # of the cameras as read; None with too few matches
 
 
 def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:
@@ -135,25 +126,16 @@ def _fit_factor(create: Callable[[float], Mistake], cameras: Cameras, matches: M
 
 @dataclass(frozen=True)
 class Report:
-    """The check of a scene.
+    """The check of a scene."""
 
-    Args:
-        sequence: the usable images, at the size at which they were matched.
-        rows: the name and text of each printed measurement.
-    """
-
-    sequence: FileSequence
-    rows: list[tuple[str, str]]
+    sequence: FileSequence  # the usable images, at the size at which they were matched
+    rows: list[tuple[str, str]]  # the name and text of each printed measurement
     matches: Matches
     verdict: Verdict
 
 
 def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = None) -> Report:
-    """Decode every image, match some of them, and diagnose the cameras.
-
-    Args:
-        bad: the damaged images that the reader found; those found here are added.
-    """
+    """Decode every image, match some, and diagnose the cameras; `bad` collects damaged images."""
     if not scene.images:
         bad.report(scene.name, 0)
     lens = scene.images[0].lens
@@ -173,9 +155,8 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
         numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
         rows.append(("lens", f"{count} of {lens.width} x {lens.height}{model}: {numbers}"))
     masks = f"{known['masks']:.1%} of the pixels are kept" if "masks" in known else "none"
-    depths = _describe_depths(sequence, known, matches, verdict)
-    rows += [("points", "none" if points is None else str(len(points)))]
-    rows += [("masks", masks), ("depth maps", depths)]
+    rows += [("points", "none" if points is None else str(len(points))), ("masks", masks)]
+    rows += [("depth maps", _describe_depths(sequence, known, matches, verdict))]
     rows += [("left out", error) for error in bad.errors]
     rows += [("matches", f"{len(matches)} of {len(matches.pairs)} pairs of images")]
     if fit := verdict.fit:
@@ -183,6 +164,53 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
         behind = f"; {fit.behind_camera:.0%} lie behind a camera"
         rows.append(("epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")))
     return Report(sequence, rows, matches, verdict)
+
+
+def read_pixels(
+    sequence: FileSequence, bad: BadImages, console: Console | None
+) -> tuple[FileSequence, dict[str, float]]:
+    """Decode every image once; return the sequence of those that are not damaged.
+
+    And the fraction of the pixels with a known depth under "depths", and of those that masks keep
+    under "masks", where there are such files.
+    """
+    intact, fractions = [], {}
+    images, hidden = sequence.scene.images, console is None
+    bar = track(images, "decoding", console=console, transient=True, disable=hidden)
+    for index, image in enumerate(bar):
+        with bad.collect():
+            views = sequence.views([index])
+            intact.append(image)
+            for name in ("depths", "masks"):
+                if (values := getattr(views, name)) is not None:
+                    fractions.setdefault(name, []).append(float((values > 0).double().mean()))
+    bad.report(sequence.name, len(intact))
+    means = {name: fmean(per_image) for name, per_image in fractions.items()}
+    return sequence.with_images(intact), means
+
+
+def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, int]:
+    """Compare depth maps with precisely triangulated matches.
+
+    Returns the median of stored over triangulated depths, and the number of points compared.
+    """
+    cameras = sequence.cameras.to(torch.float64)
+    depths, angles = triangulate(cameras, matches)
+    precise = (angles > MIN_DEPTH_ANGLE) & (depths > 0).all(-1)
+    precise &= epipolar_distances(cameras, matches) < MAX_EPIPOLAR_ERROR
+    indices, points, depths = (
+        values[precise].flatten(0, 1) for values in (matches.indices, matches.points, depths)
+    )
+    ratios = [torch.empty(0, dtype=torch.float64)]
+    for index in indices.unique().tolist():
+        in_image = indices == index
+        stored = sequence.views([index]).depths
+        assert stored is not None
+        column, row = points[in_image].long().unbind(-1)
+        ratios.append(stored[0].double()[row, column] / depths[in_image])
+    known = torch.cat(ratios)
+    known = known[known > 0]
+    return float(known.median()), len(known)
 
 
 def _describe_depths(

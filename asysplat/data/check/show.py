@@ -42,8 +42,7 @@ def print_report(report: Report, title: str, console: Console) -> None:
 def draw_report(report: Report, title: str) -> Figure:
     """Draw the path from above and from the side, and a few pairs of images below.
 
-    The images of a pair are drawn one above the other, with matched points and the epipolar lines
-    that the cameras predict for them.
+    With matched points and the epipolar lines that the cameras predict for them.
     """
     cameras = report.sequence.cameras
     image_height = min(WIDTH / MAX_PAIRS * cameras.height / cameras.width, MAX_IMAGE_HEIGHT)

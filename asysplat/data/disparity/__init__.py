@@ -31,10 +31,7 @@ def map_name(image: ImageFile, scene: Path) -> str:
 
 
 def with_disparities(posed: PosedScene, scene: Path, cache: Path) -> PosedScene:
-    """Add the existing maps in `cache` to the images of a scene with path `scene`.
-
-    Maps in the scene's own folder take precedence.
-    """
+    """Add the existing maps in `cache`, or rather in the scene's own folder, to its images."""
     maps: dict[str, Path] = {}
     for folder in (map_folder(scene, cache), scene / BESIDE):
         if folder.is_dir():
@@ -50,8 +47,7 @@ def with_disparities(posed: PosedScene, scene: Path, cache: Path) -> PosedScene:
 def write_map(path: Path, disparity: Float[ndarray, "h w"]) -> None:
     """Write disparities as a 16-bit PNG: 1 for the least, LEVELS for the greatest.
 
-    Scale and shift are not stored, since the loss ignores them; 0 means unknown. The file appears
-    complete or not at all.
+    Scale and shift are not stored, since the loss ignores them; 0 means unknown.
     """
     if not np.isfinite(disparity).all():
         raise InputError(f"{path} would hold NaN or infinity: name another --model.")

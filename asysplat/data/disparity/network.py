@@ -16,12 +16,7 @@ SHORT_SIDE = 518  # pixels of the shorter side in the network's training
 
 
 class DepthAnything:
-    """Estimates the disparity of an image, up to a scale and a shift.
-
-    Args:
-        network: pixel_values [1, 3, H, W], normalized as for ImageNet, -> `.predicted_depth`
-            [1, H, W]; its `config.patch_size` divides H and W.
-    """
+    """Estimates the disparity of an image, up to a scale and a shift, by transformers' network."""
 
     def __init__(self, network: nn.Module, device: torch.device):
         self.network, self.device = network.to(device).eval(), device

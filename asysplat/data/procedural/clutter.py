@@ -48,9 +48,8 @@ def _near_walk(plan: FloorPlan, rng: Generator) -> Float[np.ndarray, "K 2"]:
 
 def pole(plan: FloorPlan, x: float, y: float, top: float, half: float, material: Material) -> None:
     """Add an upright pole; `half` is half its width in meters."""
-    plan.add_box(
-        (x, y, (top - UNDERGROUND) / 2), (half, half, (top + UNDERGROUND) / 2), 0.0, material
-    )
+    middle, half_height = (top - UNDERGROUND) / 2, (top + UNDERGROUND) / 2
+    plan.add_box((x, y, middle), (half, half, half_height), 0.0, material)
 
 
 def trestle(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:

@@ -25,11 +25,9 @@ def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
 
 
 def sample_directions(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
-    """Return SAMPLES directions around each pixel center's, sample by sample.
+    """Return SAMPLES directions around each pixel center's, sample by sample, in camera axes.
 
-    Args:
-        directions: in camera axes, with z = 1.
-        pixel: width of a pixel at z = 1.
+    Directions have z = 1, where `pixel` is the width of a pixel.
     """
     offsets = pixel * torch.tensor(SAMPLES, device=directions.device).T[..., None]
     x, y, z = directions[:, None].expand(-1, len(SAMPLES), -1)
@@ -42,13 +40,9 @@ def average_samples(
     pixels: Int[Tensor, " E"],
     sampled: Int[Tensor, " SE"],
 ) -> Float[Tensor, "3 E"]:
-    """Average the colors of the surfaces that the samples of each pixel hit.
+    """Average the colors of the surfaces `sampled` by the rays of `sample_directions`.
 
     A surface that no neighboring pixel shows is replaced by the pixel's own.
-
-    Args:
-        colors, surfaces: at every pixel's center.
-        sampled: surface hit by each ray of `sample_directions`.
     """
     height, width = surfaces.shape
     x, y = torch.tensor(NEIGHBORS, device=pixels.device).T[..., None]

@@ -21,29 +21,17 @@ TRIES = 64  # random spots for each object
 
 @dataclass
 class FloorPlan:
-    """All solid objects, and the light.
+    """All solid objects, and the light; colors are linear RGB."""
 
-    Args:
-        walk: [T, 2] camera positions from above; objects keep clear of them.
-        boxes: (center, half sizes, yaw in radians, material).
-        spheres: (center, radius, material).
-        room: lower and upper corner; None outdoors.
-        shell: materials of the walls at +-x, +-y, ceiling and floor; outdoors that of the ground.
-        heights: [N, N] of the terrain; None in a room.
-        light: position of the lamp or sun, [3].
-        irradiance: irradiance of a surface that faces the light from close by, linear RGB [3].
-        falloff: distance at which the light is half as strong.
-        ambient: light from all directions, linear RGB [3].
-    """
-
-    walk: Float[np.ndarray, "T 2"]
-    light: np.ndarray
-    irradiance: np.ndarray
-    falloff: float
-    ambient: np.ndarray
-    shell: list[Material]
-    room: tuple[np.ndarray, np.ndarray] | None = None
-    heights: np.ndarray | None = None
+    walk: Float[np.ndarray, "T 2"]  # camera positions from above; objects keep clear of them
+    light: np.ndarray  # position of the lamp or sun
+    irradiance: np.ndarray  # of a surface that faces the light from close by
+    falloff: float  # distance at which the light is half as strong
+    ambient: np.ndarray  # light from all directions
+    shell: list[Material]  # walls at +-x, +-y, ceiling and floor; outdoors the ground
+    room: tuple[np.ndarray, np.ndarray] | None = None  # lower and upper corner; None outdoors
+    heights: np.ndarray | None = None  # [N, N] of the terrain; None in a room
+    # (center, half sizes, yaw in radians, material), (center, radius, material), (spot, radius)
     boxes: list[tuple[np.ndarray, np.ndarray, float, Material]] = field(default_factory=list)
     spheres: list[tuple[np.ndarray, float, Material]] = field(default_factory=list)
     occupied: list[tuple[np.ndarray, float]] = field(default_factory=list)

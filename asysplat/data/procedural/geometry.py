@@ -28,16 +28,11 @@ SomeSolids = TypeVar("SomeSolids", bound="Solids")
 
 @dataclass(frozen=True)
 class Cone:
-    """A cone around rays from one point, to cull objects outside of it.
-
-    Args:
-        axis: unit vector.
-        angle: between the axis and the side, radians.
-    """
+    """A cone around rays from one point, to cull objects outside of it."""
 
     apex: Float[Tensor, " 3"]
-    axis: Float[Tensor, " 3"]
-    angle: Float[Tensor, ""]
+    axis: Float[Tensor, " 3"]  # unit vector
+    angle: Float[Tensor, ""]  # between the axis and the side, radians
 
     @classmethod
     def around(cls, origins: Origins, directions: Points) -> "Cone":
@@ -179,13 +174,9 @@ class Room:
 
 @dataclass(frozen=True)
 class Terrain:
-    """A height field over the square [-extent, extent]^2, bilinear between its samples.
+    """A height field over the square [-extent, extent]^2, bilinear between its samples."""
 
-    Args:
-        field: height and its slopes along x and y, rows along y.
-    """
-
-    field: Float[Tensor, "3 N N"]
+    field: Float[Tensor, "3 N N"]  # height and its slopes along x and y, rows along y
     extent: float
 
     def sample(
@@ -213,8 +204,7 @@ class Terrain:
     def hit(self, origins: Origins, directions: Points, max_t: PerRay, refine_steps: int) -> PerRay:
         """Return the t at which each ray first goes under the ground, before `max_t`.
 
-        Steps grow with distance; the step that crosses the ground is narrowed by false position
-        (Illinois), `refine_steps` times.
+        The step that crosses it is narrowed by false position (Illinois), `refine_steps` times.
         """
         progress = torch.linspace(0, 1, MARCH_STEPS, device=max_t.device)[:, None]
         t = MIN_GROUND_T * (max_t / MIN_GROUND_T) ** progress

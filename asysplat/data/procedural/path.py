@@ -14,7 +14,7 @@ TARGET_DISTANCE = 3.0  # meters, of a target that moves with the camera
 
 Times = Float[np.ndarray, " T"]  # from 0 to 1 along the path
 Points = Float[np.ndarray, "T 3"]
-Path = Callable[[Generator, Times, float], tuple[Points, Points]]
+Path = Callable[[Generator, Times, float], tuple[Points, Points]]  # positions and targets
 
 
 def sway(rng: Generator, time: Times, *cycles: float) -> Times:
@@ -25,11 +25,7 @@ def sway(rng: Generator, time: Times, *cycles: float) -> Times:
 
 
 def arc(rng: Generator, time: Times, radius: float) -> tuple[Points, Points]:
-    """Draw an arc of 65 to 110 degrees at about `radius`, at eye level, looking across the middle.
-
-    Returns:
-        Camera positions and targets, as of all paths.
-    """
+    """Draw an arc of 65 to 110 degrees at about `radius` and eye level, looking to the middle."""
     angle = _turn(rng, time, 65.0, 110.0, 0.06)
     distance = radius * (1 + 0.12 * sway(rng, time, 0.7, 1.6))
     height = rng.uniform(1.3, 1.65) + 0.08 * sway(rng, time, 1.0, 2.3)

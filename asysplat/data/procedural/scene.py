@@ -45,7 +45,6 @@ class ProceduralScene:
     device, and the same bits on a CPU.
 
     Args:
-        seed: any integer >= 0; see `split_seed`.
         places: rooms or outdoors; with both, the seed decides.
         varied: adds thin and small near objects, gloss, antialiased edges, more kinds of camera
             paths, and focal lengths from wide to long.
@@ -102,7 +101,6 @@ class ProceduralScene:
         return Views(cameras, torch.sigmoid(light * self._gamma - self._threshold), depths)
 
     def _trace(self, cameras: Cameras) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
-        """Trace light and depth at every pixel."""
         size = (cameras.height, cameras.width)
         # All images share their intrinsics; with directions of z = 1, t is the depth.
         in_camera = cameras.select([0]).pixel_directions().flatten(0, 2).T.contiguous()
@@ -123,10 +121,8 @@ class ProceduralScene:
                 sharp = light[view].clone()
                 for part in edges.split(max(1, chunk // len(SAMPLES))) if len(edges) else ():
                     around = pose[:3, :3] @ sample_directions(in_camera[:, part], pixel)
-                    sampled = self._world.surfaces(pose[:3, 3:], around, candidates=surfaces)
-                    light[view, :, part] = average_samples(
-                        sharp, surfaces.view(size), part, sampled
-                    )
+                    hit = self._world.surfaces(pose[:3, 3:], around, candidates=surfaces)
+                    light[view, :, part] = average_samples(sharp, surfaces.view(size), part, hit)
         return light.unflatten(-1, size), depths.unflatten(-1, size)
 
     def _expose(self) -> None:

@@ -136,9 +136,7 @@ def fractal_noise(
 ) -> Float[Tensor, "2 R"]:
     """Sum value noise of amplitude about 1 over the octaves that a pixel can resolve.
 
-    Args:
-        uv: in lattice points of the coarsest octave.
-        footprint: the pixel's width in the same unit.
+    `uv` and the pixel's width are in lattice points of the coarsest octave.
     """
     octave = torch.arange(OCTAVES, device=uv.device)
     frequency = 2.0**octave
@@ -187,12 +185,9 @@ def albedo(
     uv: Float[Tensor, "2 R"],
     footprint: Float[Tensor, " R"],
 ) -> Float[Tensor, "3 R"]:
-    """Compute the linear color of each hit.
+    """Compute the linear color of each hit of a surface, `Material.row`; its gloss is ignored.
 
-    Args:
-        rows: `Material.row` of each hit's surface; its gloss is ignored.
-        uv: position on the surface, meters.
-        footprint: width of the pixel on the surface, meters.
+    The position and the width of the pixel on the surface are in meters.
     """
     base, accent, cell, (shift, joint, variation, checker), grain, _ = rows.split(
         (3, 3, 2, 4, 2, 2)

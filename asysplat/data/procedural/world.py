@@ -72,8 +72,7 @@ class World:
     ) -> tuple[Points, PerRay, Surface]:
         """Return linear color, t and surface of the nearest hit of rays origin + t * direction.
 
-        Args:
-            pixel: width of a pixel at t = 1, meters.
+        `pixel` is the width of a pixel at t = 1, in meters.
         """
         cone = Cone.around(origins, directions)
         boxes, spheres = self._boxes.within(cone), self._spheres.within(cone)
@@ -119,12 +118,9 @@ class World:
         return color
 
     def surfaces(self, origins: Origins, directions: Points, candidates: Index) -> Surface:
-        """Return the surface of the nearest hit of each ray, numbered as in `trace`.
+        """Return which of the `candidates` each ray hits first, numbered as in `trace`.
 
-        Which surface is nearest hardly depends on the exact intersection with the ground.
-
-        Args:
-            candidates: surfaces to test; other objects are ignored.
+        It hardly depends on the exact intersection with the ground.
         """
         tested = torch.zeros(self._surfaces.shape[1] + 1, dtype=torch.bool, device=self._sky.device)
         tested[candidates] = True  # the last is the sky
@@ -163,12 +159,9 @@ class World:
         lit = direct.nonzero()[:, 0]
         if len(lit):
             start, to_light = (points + SHADOW_OFFSET * normals)[:, lit], to_light[:, lit]
-            cone = Cone.around(self._light, start - self._light)
-            boxes, spheres = self._near(cone)
-            blocked = (boxes.hit(start, to_light).amin(0) < 1) | (
-                spheres.hit(start, to_light).amin(0) < 1
-            )
-            direct[lit[blocked]] = 0
+            solids = self._near(Cone.around(self._light, start - self._light))
+            by_box, by_sphere = (solid.hit(start, to_light).amin(0) < 1 for solid in solids)
+            direct[lit[by_box | by_sphere]] = 0
         return direct
 
     def _near(self, cone: Cone, margin: float = 0.0) -> tuple[Boxes, Spheres]:
@@ -185,8 +178,7 @@ class World:
         # Once from the cone's surface hits to the points, and once from there to the objects.
         boxes, spheres = self._near(cone, 2 * OCCLUSION_DISTANCE)
         gap = torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
-        gap = gap / OCCLUSION_DISTANCE
-        return MIN_AMBIENT + (1 - MIN_AMBIENT) * gap.clamp(0, 1)
+        return MIN_AMBIENT + (1 - MIN_AMBIENT) * (gap / OCCLUSION_DISTANCE).clamp(0, 1)
 
     def _sky_color(self, points: Points) -> Points:
         """Blend from a pale horizon to a blue zenith, with clouds."""

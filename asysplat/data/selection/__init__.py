@@ -78,10 +78,7 @@ def training_selection(
 ) -> Selection:
     """Select inputs evenly over a random window, and random targets within it.
 
-    Args:
-        window: least and greatest number of images to draw from, clipped to the sequence; None: all
-            of its images.
-        targets_may_be_inputs: whether targets are drawn from all images of the window.
+    `window`: least and greatest number of images, clipped to the sequence; None: all of them.
     """
     _check_length(num_images, num_inputs, num_targets)
     shortest, longest = (num_images, num_images) if window is None else window
@@ -137,8 +134,7 @@ def first_96_selection(
 ) -> Selection:
     """Select as the paper's ablations (Suppl. A): inputs evenly over the first 96 images.
 
-    Every 8th of them is a target, and no input. Even positions are truncated to whole ones, as in
-    Long-LRM (data/dataset.py); the paper does not say.
+    Positions are truncated to whole ones, as in Long-LRM (data/dataset.py); the paper does not say.
     """
     images, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
     check_held_out(num_images, len(images), num_inputs, split)
@@ -149,8 +145,8 @@ def first_96_selection(
 def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
     """Return the images that inputs are chosen from, and the targets.
 
-    For test, every 8th image is a target, and inputs are chosen from all others. For val, at most
-    `num_targets` images are targets, and inputs are chosen from the training images.
+    For test, these are every 8th image and all others; for val, at most `num_targets` held-out
+    images and the training images.
     """
     targets = held_out(num_images, split)
     if split == "val":
@@ -193,7 +189,6 @@ def kmeans_selection(
     """Select as the paper's tests do: inputs by k-means on positions and viewing directions.
 
     Every 8th image is a target; of the others, those nearest to the centers are inputs.
-    Deterministic, on every machine.
     """
     images, targets = paper_split(cameras.num_views, num_targets, split)
     check_held_out(cameras.num_views, len(images), num_inputs, split)
@@ -202,10 +197,9 @@ def kmeans_selection(
 
 
 def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
-    """Return positions, relative to their mean, and viewing directions of length 1.
+    """Return positions, relative to their mean, and viewing directions, as Long-LRM does.
 
-    As in Long-LRM (data/dataset.py): positions are in the units of the data. Rounded, relative to
-    their extent, so that float noise makes no difference.
+    Rounded, relative to their extent, so that float noise makes no difference.
     """
     poses = cameras.cam_to_world.double().cpu().numpy()
     offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
@@ -218,10 +212,7 @@ def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
 
 
 def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]:
-    """Choose `count` different rows, each nearest to a center of k-means; sorted.
-
-    Of rows whose distances differ by float noise, the first is taken.
-    """
+    """Choose `count` different rows, sorted: each the first of those nearest to a center."""
     from sklearn.cluster import KMeans  # slow to import
 
     model = KMeans(count, init="k-means++", n_init=1, random_state=0)

@@ -32,10 +32,9 @@ class Entry:
 def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
     """Read an index of either form: scene -> entry.
 
-    pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; scenes that are null are
-    left out, and a target may be an input. Long-LRM's: a list of {"scene_name": ...,
-    "fold_8_kmeans_32_input": [...]}, where every 8th image is a target; or a scene's own
-    opencv_cameras.json with such a list; or the folder of many scenes.
+    pixelSplat's: {scene: {"context": [...], "target": [...]} or null, which is left out}.
+    Long-LRM's: a list of {"scene_name": ..., "fold_8_kmeans_32_input": [...]}, where every 8th
+    image is a target; or a scene's own opencv_cameras.json with such a list; or a folder of scenes.
     """
     path = Path(path)
     if path.is_dir():
@@ -71,14 +70,13 @@ def select_from_index(
     targets = entry.targets
     if isinstance(targets, int):
         targets = list(range(0, num_images, targets))
-    selection = Selection(entry.inputs, targets)
-    last = max(selection.inputs + selection.targets)
+    last = max(entry.inputs + targets)
     if last >= num_images:
         raise InputError(
             f"{where} names image {last}, and the scene has {num_images} images: it belongs "
             "to another version of the scene; write the index again for this one."
         )
-    return selection
+    return Selection(entry.inputs, targets)
 
 
 def write_index(path: Path, index: Mapping[str, Selection]) -> None:

@@ -33,7 +33,7 @@ RANGES = [
     for axis in axes
 ]
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-XYZ_BITS, COLOR_BITS, ROTATION_BITS = (11, 10, 11), (8, 8, 8, 8), (2, 10, 10, 10)
+BITS = ((11, 10, 11), (2, 10, 10, 10), (11, 10, 11), (8, 8, 8, 8))  # of the numbers in PACKED
 MAX_LOG_SCALE = 20
 SH_RANGE = 8  # from -4 to 4, in 256 steps
 
@@ -41,21 +41,13 @@ SH_RANGE = 8  # from -4 to 4, in 256 steps
 def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> None:
     """Write one scene, without batch dimension, as compressed PLY.
 
-    Gaussians are ordered along a Z-order curve, so that those of a range are near each other.
-
-    Args:
-        antialiased: as for `render`: a comment tells it.
+    Gaussians are ordered along a Z-order curve, so that those of a range are near each other. A
+    comment tells whether they are to be rendered `antialiased`.
     """
     scene = in_morton_order(prepare_for_export(gaussians))
     count, chunks = scene.num_gaussians, -(-scene.num_gaussians // CHUNK)
-    values = np.stack(
-        (
-            scene.means.numpy(),
-            scene.scales.log().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).numpy(),
-            (0.5 + SH_C0 * scene.sh[:, 0]).numpy(),
-        ),
-        1,
-    )
+    log_scales = scene.scales.log().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    values = torch.stack((scene.means, log_scales, 0.5 + SH_C0 * scene.sh[:, 0]), 1).numpy()
     # The last Gaussian fills the last chunk, which widens no range.
     filled = np.concatenate((values, values[-1:].repeat(chunks * CHUNK - count, 0)))
     filled = filled.reshape(chunks, CHUNK, 3, 3)
@@ -66,15 +58,8 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
     largest, rest = (part.numpy() for part in split_largest(scene.quats))
     rotation = np.concatenate((largest[:, None] / 3, rest * 0.5**0.5 + 0.5), 1)
     color = np.concatenate((color, scene.opacities[:, None].numpy()), 1)
-    packed = [
-        _pack(numbers, bits)
-        for numbers, bits in (
-            (position, XYZ_BITS),
-            (rotation, ROTATION_BITS),
-            (scale, XYZ_BITS),
-            (color, COLOR_BITS),
-        )
-    ]
+    places = (position, rotation, scale, color)
+    packed = [_pack(numbers, bits) for numbers, bits in zip(places, BITS, strict=True)]
     sh = scene.sh[:, 1:].mT.flatten(1).numpy()
     steps = np.floor((sh / SH_RANGE + 0.5) * 256).clip(0, 255).astype(np.uint8)
     header = ["ply", "format binary_little_endian 1.0", f"comment antialiased {int(antialiased)}"]
@@ -98,7 +83,7 @@ def unpack(elements: dict[str, ndarray]) -> Gaussians:
     ranges = ranges[np.arange(len(vertices)) // CHUNK]
     (position, rotation, scale, color) = (
         _unpack(vertices[name].astype(np.uint32), bits)
-        for name, bits in zip(PACKED, (XYZ_BITS, ROTATION_BITS, XYZ_BITS, COLOR_BITS), strict=True)
+        for name, bits in zip(PACKED, BITS, strict=True)
     )
     rgb = _within(ranges[:, 2], color[:, :3]) if len(names) == len(RANGES) else color[:, :3]
     sh = (torch.from_numpy(rgb) - 0.5).div(SH_C0).float()[:, None]

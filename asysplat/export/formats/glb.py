@@ -41,10 +41,9 @@ TOLERANCE = 1e-4  # of rotations that others wrote in float32
 
 
 def write_glb(path: str | Path, gaussians: Gaussians) -> None:
-    """Write one scene, without batch dimension, as binary glTF.
+    """Write one scene, without batch dimension; programs that lack the extension show points.
 
-    Quaternions are normalized; all else keeps its bits. Programs that lack the extension show
-    colored points.
+    Quaternions are normalized; all else keeps its bits.
     """
     scene = half_turn(prepare_for_export(gaussians), 2)
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=-1).float().roll(-1, 1)
@@ -102,10 +101,9 @@ def _sh_names(count: int) -> list[str]:
 
 
 def read_glb(path: str | Path) -> Gaussians:
-    """Read the Gaussians of a binary glTF file, in the scene's coordinates.
+    """Read the Gaussians of a binary glTF file, which may hold other meshes, too.
 
-    The file may hold other meshes. Nodes may move, turn and scale the Gaussians, by the same factor
-    along all axes.
+    Nodes may move, turn and scale them, by the same factor along all axes.
     """
     with reading(path, "binary glTF") as path:
         root, buffer = _read_chunks(path.read_bytes())

@@ -20,9 +20,9 @@ GENERIC_DIRECTION = (0.36, 0.48, 0.8)  # no SH function up to degree 3 is 0 alon
 
 
 def morton_order(means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
-    """Compute an order along a Z-order curve: neighbors in space become neighbors in the file.
+    """Compute an order along a Z-order curve, in which bytes compress to less.
 
-    The bytes of one property then resemble each other, and compress to less.
+    Neighbors in space become neighbors in the file.
     """
     low = means.double().amin(0)
     extent = (means.double().amax(0) - low).amax().clamp_min(1e-300)
@@ -45,13 +45,10 @@ def in_morton_order(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda field: field[order])
 
 
-def split_largest(
-    quats: Float[Tensor, "N 4"],
-) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """Split rotations into the index of the largest component and the other three, in order.
+def split_largest(quats: Float[Tensor, "N 4"]) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"]]:
+    """Split rotations into the index of the largest component, made positive, and the other three.
 
-    The largest is positive after a change of sign, which leaves the rotation; the others are in
-    [-1/sqrt(2), 1/sqrt(2)].
+    These are in [-1/sqrt(2), 1/sqrt(2)].
     """
     quats = torch.nn.functional.normalize(quats.double(), dim=-1)
     largest = quats.abs().argmax(-1)
@@ -71,10 +68,9 @@ def join_largest(largest: Int[ndarray, "N"], rest: Float[ndarray, "N 3"]) -> Flo
 
 
 def half_turn(gaussians: Gaussians, axis: int) -> Gaussians:
-    """Turn a scene by 180 degrees around axis 0, 1 or 2, without rounding.
+    """Turn a scene by 180 degrees around an axis, without rounding.
 
-    Around x, OpenCV's axes (right, down, forward) become OpenGL's (right, up, backward); around z,
-    glTF's (left, up, forward).
+    OpenCV's axes become OpenGL's, right, up, backward (around x), or glTF's, left, up, forward (z).
     """
     signs = -torch.ones(3, dtype=torch.float64)
     signs[axis] = 1
@@ -92,10 +88,7 @@ def half_turn(gaussians: Gaussians, axis: int) -> Gaussians:
 
 @contextmanager
 def reading(path: str | Path, kind: str) -> Generator[Path]:
-    """Yield the path of a file; errors inside become a sentence that begins with it.
-
-    A file that is cut short makes its reader raise anything.
-    """
+    """Yield the path of a file; errors inside become a sentence that begins with it."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file: name an existing one.")
@@ -105,7 +98,7 @@ def reading(path: str | Path, kind: str) -> Generator[Path]:
         raise InputError(f"{path}: {error}") from error
     except MemoryError:  # a large file, not a damaged one
         raise
-    except Exception as error:
+    except Exception as error:  # a file that is cut short makes its reader raise anything
         reason = f"{path} cannot be read as {kind} ({brief(error)})"
         raise InputError(f"{reason}: it is cut short or of another format.") from error
 

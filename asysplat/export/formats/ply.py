@@ -66,12 +66,8 @@ def write_ply(
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
     header = ["ply", "format binary_little_endian 1.0"]
     degree = math.isqrt(gaussians.sh.shape[1]) - 1
-    comments = {
-        "antialiased": (int(antialiased),),
-        "sh_degree": (degree,),
-        "background": background,
-    }
-    comments |= {"offset": offset} if any(offset) else {}
+    comments = {"antialiased": (int(antialiased),), "sh_degree": (degree,)}
+    comments |= {"background": background, "offset": offset if any(offset) else ()}
     header += [f"comment {k} {' '.join(map(repr, v))}" for k, v in comments.items() if v]
     header += [f"element vertex {len(table)}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]

@@ -50,10 +50,7 @@ def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
     Means keep 16 bits of sign(x) log(1 + |x|) between the scene's bounds, opacities and three
     components of rotations 8 bits; log scales and colors become the nearest of 256 values that are
     fitted to the scene, the other SH the nearest of a palette. Gaussians are ordered along a
-    Z-order curve.
-
-    Args:
-        antialiased: as for `render`: meta.json tells it.
+    Z-order curve. meta.json tells whether they are to be rendered `antialiased`.
     """
     content = encode_sog(gaussians, antialiased)
     with atomic_write(path) as partial:
@@ -75,10 +72,8 @@ def encode_sog(gaussians: Gaussians, antialiased: bool = False) -> bytes:
     if scene.sh.shape[1] > 1:
         records["shN"], centroids, labels = _quantize_sh(scene.sh[:, 1:])
         row = PALETTE_WIDTH * (scene.sh.shape[1] - 1)
-        files |= {
-            "shN_centroids.webp": _webp(centroids, row),
-            "shN_labels.webp": _webp(labels, width),
-        }
+        files["shN_centroids.webp"] = _webp(centroids, row)
+        files["shN_labels.webp"] = _webp(labels, width)
     meta = {"version": VERSION, "count": count, "antialias": antialiased, **records}
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
     bundle = BytesIO()
@@ -177,8 +172,7 @@ def _palette(
 ) -> tuple[Float[Tensor, "colors terms"], Int[Tensor, "N"]]:
     """Fit vectors by k-means, and compute the index of one near to each value.
 
-    Values are split into cells and each cell among its part of the vectors: distances to all
-    vectors would take a hundred times as long.
+    In cells of values, as distances to all vectors would take a hundred times as long.
     """
     size = min(max(len(values) // PALETTE_SHARE, MIN_PALETTE), MAX_PALETTE)
     if len(values) <= size:

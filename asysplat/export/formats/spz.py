@@ -32,9 +32,8 @@ from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
 MAGIC = b"NGSP"
-HEADER = struct.Struct(
-    "<4sIIBBBB"
-)  # magic, version, count, SH degree, fraction bits, flags, streams
+# Magic, version, count, SH degree, fraction bits, flags, streams.
+HEADER = struct.Struct("<4sIIBBBB")
 TABLE = struct.Struct("<QQ")  # of a stream in version 4: compressed and full size
 HEADER_4 = 32  # bytes of the header in version 4
 ANTIALIASED = 1  # a flag
@@ -68,12 +67,8 @@ def write_spz(
 
     Positions are rounded to a 16th of the small Gaussians' size if 24 bits allow, scales to 3 %,
     opacities to 1/255, SH to 5 bits of [-1, 1] in degree 1 and 4 above, rotations to 0.1 degrees.
-    Gaussians are ordered along a Z-order curve.
-
-    Args:
-        gaussians: [N].
-        version: 2 or 3, gzip, which most programs read; 4, Zstandard, needs the package zstandard.
-        antialiased: as for `render`: a flag tells it.
+    Gaussians are ordered along a Z-order curve. A flag tells whether they are to be rendered
+    `antialiased`. Most programs read version 2 or 3, gzip; 4, Zstandard, needs a package for it.
     """
     content = encode_spz(gaussians, version, antialiased)
     with atomic_write(path) as partial:
@@ -85,17 +80,9 @@ def encode_spz(gaussians: Gaussians, version: int = 3, antialiased: bool = False
     if version not in (2, 3, 4):
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
     scene = in_morton_order(half_turn(prepare_for_export(gaussians), 0))
-    fraction_bits = _fraction_bits(scene)
-    degree = math.isqrt(scene.sh.shape[1]) - 1
-    streams = [stream.tobytes() for stream in _streams(scene, fraction_bits, version)]
-    header = [
-        MAGIC,
-        version,
-        len(scene.opacities),
-        degree,
-        fraction_bits,
-        ANTIALIASED * antialiased,
-    ]
+    degree, bits = math.isqrt(scene.sh.shape[1]) - 1, _fraction_bits(scene)
+    streams = [stream.tobytes() for stream in _streams(scene, bits, version)]
+    header = (MAGIC, version, scene.num_gaussians, degree, bits, ANTIALIASED * antialiased)
     if version < 4:
         return gzip.compress(b"".join([HEADER.pack(*header, 0), *streams]), GZIP_LEVEL, mtime=0)
     streams = [stream for stream in streams if stream]
@@ -107,10 +94,7 @@ def encode_spz(gaussians: Gaussians, version: int = 3, antialiased: bool = False
 
 
 def _fraction_bits(scene: Gaussians) -> int:
-    """Choose the precision of positions: a fraction of the small Gaussians' size.
-
-    Finer bits would be noise, which does not compress.
-    """
+    """Choose the precision of positions: finer than small Gaussians, the bits would be noise."""
     largest, size = scene.means.abs().max().item(), scene.scales.amax(1)
     small = size.kthvalue(1 + int(SMALL_QUANTILE * (len(size) - 1))).values.item()
     wanted = math.ceil(math.log2(STEPS_PER_SIZE / small))
