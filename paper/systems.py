@@ -7,9 +7,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from asysplat.runs.evaluation_target import SYSTEM, options_of_test
 from asysplat.runs.runs import EVALUATION, Run, files_below
 from asysplat.runs.summary import TESTED, read_results
-from asysplat.runs.systems import SYSTEM, options_of_test
 from paper.notes import data_text
 from paper.tables import Number, PaperRow, PaperTable
 

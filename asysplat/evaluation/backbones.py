@@ -38,12 +38,9 @@ def find_backbone(
 ) -> dict[str, Tensor] | None:
     """Load ImageNet weights of a network's convolutions: torchvision's, or MatConvNet's of VGG19.
 
-    They are read from torch's hub cache or else from `<name>_features_fp16.pth` in `backbone_dir`.
-    If neither exists, they are downloaded into the cache if `download` allows it.
-
-    Returns:
-        `features.N.weight` and `features.N.bias` in fp32, with the values of half precision, so
-        that both files give the same numbers; None if the weights were not found.
+    They are read from torch's hub cache or else from `<name>_features_fp16.pth` in `backbone_dir`,
+    or downloaded into the cache if `download` allows it; else None. In fp32, they have the values
+    of half precision, so that both files give the same numbers.
     """
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if backbone_dir is not None:
@@ -112,9 +109,8 @@ def _layers(name: Backbone) -> nn.Sequential:
 class VGGFeatures(nn.Module):
     """Computes frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
 
-    Args:
-        taps: indices of the layers of torchvision's `features` whose outputs are returned.
-        std: RGB; divides the images after ImageNet's mean color is subtracted.
+    Those of the layers `taps` of torchvision's `features`, of images in [0, 1] that are divided by
+    `std` after ImageNet's mean color is subtracted.
     """
 
     def __init__(
@@ -140,10 +136,6 @@ class VGGFeatures(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """Compute the activations at `taps` of images in [0, 1].
-
-        Activations after the n-th pooling have 1 / 2^n of the height and width.
-        """
         x = (images - self.mean) / self.std
         activations = []
         for index, layer in enumerate(self.features):

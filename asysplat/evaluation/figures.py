@@ -15,9 +15,8 @@ MAX_ERROR = 0.5  # at the bright end of the color map
 def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     """Draw a row of images for each target view of one scene; no field has a batch dimension.
 
-    Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
-    rendered inverse depth, if it is known, and, if the data has depths, the true one on the same
-    scale. Pixels that a mask excludes are blank in the last three.
+    The nearest input, the target, the rendering with its PSNR, the absolute error, the rendered
+    inverse depth and the true one on the same scale, if known; what a mask excludes is blank.
     """
     images = {
         "nearest input": nearest_view_images(inputs, targets),
@@ -45,10 +44,8 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
         error, *disparities = (values[view].cpu().float() for values in maps.values())
         row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
-        near = (
-            disparities[-1].flatten().nanquantile(0.99).nan_to_num().item() if disparities else 0.0
-        )
         for axis, values in zip(row[4:], disparities, strict=True):
+            near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
             axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
         for axis in row:
             axis.set(xticks=[], yticks=[])
@@ -56,15 +53,11 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:
-    """Draw the validation PSNR over training, and that of the baselines.
-
-    Args:
-        rows: one for each validation, with minutes, step, psnr and each baseline's <name>/psnr.
-    """
+    """Draw the PSNR of each validation, a row, and that of the baselines."""
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axis = figure.subplots()
-    minutes = [row["minutes"] for row in rows]
-    axis.plot(minutes, [row["psnr"] for row in rows], "o-", label="trained")
+    minutes, trained = ([row[name] for row in rows] for name in ("minutes", "psnr"))
+    axis.plot(minutes, trained, "o-", label="trained")
     for number, (name, (title, _)) in enumerate(BASELINES.items(), 1):
         axis.axhline(rows[-1][f"{name}/psnr"], color=f"C{number}", ls="--", label=title)
     axis.set(xlabel="minutes of training", ylabel="validation PSNR (dB)")

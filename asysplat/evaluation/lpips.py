@@ -17,12 +17,9 @@ MIN_SIDE = 32  # pixels
 def load_lpips(
     net: Literal["alex", "vgg"], backbone_dir: Path | None, download: bool = False
 ) -> nn.Module | None:
-    """Build the frozen LPIPS network, or return None if its backbone is not on this machine.
+    """Build the frozen LPIPS network; None if `find_backbone` does not find its backbone.
 
     The linear heads come with the lpips package.
-
-    Args:
-        backbone_dir: folder that may hold the backbone's weights, see `find_backbone`.
     """
     import lpips  # not above: it imports torchvision, which takes as long as torch
 

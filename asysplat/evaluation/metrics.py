@@ -13,7 +13,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 from asysplat.kernels.dispatch import without_autocast
-from asysplat.scene import Cameras, Views
+from asysplat.scene import Views
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
 SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side
@@ -48,12 +48,9 @@ def ssim(
 ) -> PerView:
     """Compute the SSIM of each image in [0, 1] (Wang et al. 2004), mean over the channels.
 
-    `rendered` is clamped, the data range is 1, and only windows inside the image count.
-
-    Args:
-        window: "gaussian": 11x11, sigma 1.5, or "uniform": 7x7.
-        covariance: weighted sum of the products of deviations within a window ("biased"), or this
-            sum times n / (n - 1) for its n pixels ("sample"), as in scikit-image.
+    `rendered` is clamped, the data range is 1, and only windows inside the image count. The
+    covariance is the weighted sum of the products of deviations within a window ("biased"), or this
+    sum times n / (n - 1) for its n pixels ("sample"), as in scikit-image.
     """
     # Not above: importing torchmetrics takes longer than torch.
     from torchmetrics.functional.image import structural_similarity_index_measure
@@ -96,9 +93,8 @@ def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") 
 
     Args:
         depth, target_depth: along the camera's z axis; a target of 0 is unknown.
-        alignment: "median" first scales each view's depth so that the medians agree
-            (the lower of the two middle values of an even number of pixels), unless the scale would
-            not be finite.
+        alignment: "median" first scales each view's depth so that the (lower) medians agree,
+            unless the scale would not be finite.
 
     Returns:
         NaN for a view without a known depth.
@@ -148,7 +144,11 @@ def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch 
     centers, the extent (the largest distance between two input centers), and the angle between the
     viewing directions. If all inputs share one center, the angle alone decides.
     """
-    nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
+    to, given = targets.cameras, inputs.cameras
+    extent = _distances(given.centers, given.centers).amax((-2, -1), keepdim=True)
+    cosine = to.cam_to_world[..., :3, 2] @ given.cam_to_world[..., :3, 2].mT
+    distance = _distances(to.centers, given.centers) / extent.where(extent > 0, torch.inf)
+    nearest = (distance + cosine.clamp(-1, 1).acos() / torch.pi).argmin(-1)
     return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
 
 
@@ -156,14 +156,6 @@ BASELINES = {  # name in results: title in tables, and what draws the targets
     "mean_color": ("mean color", mean_color_images),
     "nearest_view": ("nearest view, copied", nearest_view_images),
 }
-
-
-def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:
-    extent = _distances(inputs.centers, inputs.centers).amax((-2, -1), keepdim=True)
-    distance = _distances(targets.centers, inputs.centers)
-    cosine = targets.cam_to_world[..., :3, 2] @ inputs.cam_to_world[..., :3, 2].mT
-    angle = cosine.clamp(-1, 1).acos()
-    return distance / extent.where(extent > 0, torch.inf) + angle / torch.pi
 
 
 def _distances(
@@ -180,9 +172,7 @@ LABELS = ("set", "scene", "images", "view", "method")
 def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
     """Average every numeric column over the images that have it; NaN is left out.
 
-    Args:
-        rows: images of one test set.
-        over: "images": all at once, or "scenes": the images of each scene first, then the scenes.
+    Over "scenes", the images of each scene come first.
     """
     if over == "scenes":
         scenes: dict[str | float, list[ImageRow]] = {}

@@ -53,18 +53,13 @@ class PostOptimization:
 
     The input views are rendered from the predicted Gaussians; their mean squared error optimizes
     means and SH, all views in each step. Scenes of other kinds are measured as they are.
-
-    Args:
-        steps: after which to measure, increasing; 0: as predicted.
-        lpips: as for `Protocol.image_metrics`.
-        background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
-        backgrounds: scene's name -> background of this scene, where another one is known.
     """
 
-    steps: Sequence[int]
+    steps: Sequence[int]  # after which to measure, increasing; 0: as predicted
     protocol: Protocol
     lpips: nn.Module | None
-    background: Float[Tensor, "3"] | None = None
+    background: Float[Tensor, "3"] | None = None  # None: the mean color of the inputs
+    # By the names of scenes of which another one is known.
     backgrounds: Mapping[str, Float[Tensor, "3"]] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -83,20 +78,16 @@ class PostOptimization:
         targets: Views,
         watch: StepCallback = lambda step, rendering: None,
     ) -> SceneResult:
-        """Measure one scene; the costs do not include the metrics.
+        """Measure one scene, without batch dimension; the costs do not include the metrics.
 
-        Args:
-            predict: the input views -> [N] Gaussians, or another scene, in their frame.
-            inputs, targets: the scene's views, without a batch dimension.
-            watch: called after each step with the number of steps and, at the steps to measure, the
-                rendering of the targets.
+        `watch` is called after each step with the number of steps and, at the steps to measure, the
+        rendering of the targets.
         """
         background = self.backgrounds.get(scene, self.background)
         if background is None:
             background = inputs.mean_color()
         result = SceneResult(scene)
-        baselines = self.protocol.measure_baselines(inputs, targets, self.lpips)
-        for method, rows in baselines.items():
+        for method, rows in self.protocol.measure_baselines(inputs, targets, self.lpips).items():
             result.add("targets", method, rows)
         meter = CostMeter(inputs.images.device)
 
@@ -128,8 +119,7 @@ class PostOptimization:
         predicted = predict(inputs)
         if 0 in self.steps:
             measure(0, predicted)
-        steps = self.steps[-1]
-        if steps > 0:
+        if (steps := self.steps[-1]) > 0:
             if not isinstance(predicted, Gaussians):
                 raise InputError(
                     f"post_optimization_steps={self.steps}: only Gaussians that are the same in "

@@ -57,11 +57,7 @@ class Protocol:
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: nn.Module | None
     ) -> dict[str, PerView]:
-        """Compute PSNR, SSIM and LPIPS of each image.
-
-        Args:
-            lpips: network with the backbone `lpips_net`, see `load_lpips`; None for no LPIPS.
-        """
+        """Compute PSNR, SSIM and, with the network of `load_lpips`, LPIPS of each image."""
         prepared, target = self._prepare(rendered, targets), targets.images
         values = {
             "psnr": metrics.psnr(prepared, target),
@@ -105,9 +101,7 @@ class Protocol:
     ) -> list[dict[str, float]]:
         """Compute the metrics of each view by itself, as SSIM of many takes much memory.
 
-        Args:
-            rendered, depths: renderings of the targets; without depths only images are measured.
-            psnr_only: compute no other metric.
+        Without depths only images are measured.
         """
         rows = []
         for view in range(targets.num_views):

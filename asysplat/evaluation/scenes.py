@@ -18,7 +18,6 @@ from rich.progress import (
 from torch.utils.data import Dataset
 
 from asysplat.data.datamodule import Sample
-from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.metrics import ImageRow, average
@@ -39,16 +38,13 @@ def measure_scenes(
     scene_folder: Path,
     early_exit: Mapping[str, float],
 ) -> dict[str, list[SceneResult]]:
-    """Measure every scene that has no result yet, with a progress bar, and draw the first.
+    """Measure every scene that has no result in `scene_folder` yet, with a progress bar.
 
     Args:
-        tests: test set -> its scenes, the data set's own set first; a scene has its name, `scene`,
-            `inputs` and `targets`.
-        predictor: returns the `predict` of a scene, whose costs are measured; see
-            `PostOptimization`.
-        folder: folder for figures/evaluation-post<steps>.png, which show the first scene at the
-            first and the last of the steps.
-        scene_folder: folder of the results of single scenes, which are read and written there.
+        tests: test set -> its scenes, the data set's own set first.
+        predictor: returns the `predict` of a scene, whose costs are measured.
+        folder: for figures/evaluation-post<steps>.png, which show the first scene at the first and
+            the last of the steps.
         early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
     """
     make_folder(scene_folder, "paths.logs")
@@ -88,7 +84,7 @@ def measure_scenes(
             for index in range(len(samples)):
                 path = scene_folder / f"{name}-{index}.json"
                 if path.exists():
-                    result = read_result(path)
+                    result = SceneResult(**read_json(path))
                     stored += 1
                 else:
                     result = measure_scene(name, index)
@@ -99,14 +95,6 @@ def measure_scenes(
             message = f"measured before, as {scene_folder} has them: {stored} scenes"
             bars.console.print(message, soft_wrap=True, highlight=False)
     return results
-
-
-def read_result(path: Path) -> SceneResult:
-    """Read what `save_result` wrote."""
-    try:
-        return SceneResult(**read_json(path))
-    except TypeError as error:
-        raise InputError(f"{path} is not the result of a scene: remove it.") from error
 
 
 def save_result(path: Path, result: SceneResult) -> None:
@@ -128,11 +116,10 @@ def image_rows(scenes: Scenes) -> list[ImageRow]:
 def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, float]:
     """Average over each test set; `over`: see `average`.
 
-    Returns:
-        test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
-        baseline/<set>/<baseline>/<metric>, and cost/gaussians, cost/post<steps>/seconds (the
-        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/. With an early
-        exit also early_exit/<set>/<what>.
+    As test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
+    baseline/<set>/<baseline>/<metric>, cost/gaussians, cost/post<steps>/seconds, see
+    `mean_but_longest`, and /gb, the largest, of further sets under cost/<set>/, and
+    early_exit/<set>/<what>.
     """
     averages: dict[str, float] = {}
     main = next(iter(scenes))

@@ -27,8 +27,7 @@ def module_flops(net: nn.Module, inputs: object) -> tuple[int, Any]:
 
     2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
     and BatchNorm. Like a profiler of modules, it does not count attention products, scans, RMSNorm,
-    activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel). Works on the meta
-    device.
+    activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel).
     """
     total = 0
 
@@ -65,15 +64,9 @@ def blank_views(num_views: int, height: int, width: int) -> Views:
 
 
 def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dict[str, float | int]:
-    """Count the costs of the forward pass of one scene.
+    """Count the costs of the forward pass of one scene, on a copy on the meta device.
 
-    Args:
-        net: on any device; its costs are counted on a copy on the meta device.
-        num_views, height, width: number and size of the input views.
-
-    Returns:
-        parameters; geometry_ratio, of 1; gflops as the paper counts them (`module_flops`) and
-        gflops_true as `true_flops` does, in 1e9; gaussians, their number; and `activation_gb`.
+    Among them gflops as the paper counts them (`module_flops`), and gflops_true as `true_flops`.
     """
     on_meta, products = copy.deepcopy(net).to("meta"), FlopCounterMode(display=False)
     with torch.device("meta"), torch.no_grad(), products:
@@ -94,8 +87,7 @@ def true_flops(net: nn.Module, num_views: int, height: int, width: int) -> int:
     On the meta device, as torch's counter may not know the kernel elsewhere (some releases count
     attention on a CPU as 0). Other element-wise work is not counted.
     """
-    on_meta = copy.deepcopy(net).to("meta")
-    counter = FlopCounterMode(display=False)
+    on_meta, counter = copy.deepcopy(net).to("meta"), FlopCounterMode(display=False)
     with torch.device("meta"), torch.no_grad(), counter:
         on_meta(blank_views(num_views, height, width))
     return counter.get_total_flops()
@@ -104,8 +96,8 @@ def true_flops(net: nn.Module, num_views: int, height: int, width: int) -> int:
 def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
     """Count what one scene's forward pass saves for the backward pass, in 1e9 bytes.
 
-    It is counted on fake CPU tensors, which have no content, in fp32 or in the caller's autocast,
-    without layer checkpointing and parameters; attention saves no scores.
+    In fp32 or the caller's autocast, without layer checkpointing and parameters, on fake CPU
+    tensors; attention saves no scores.
     """
     storages: dict[int, UntypedStorage] = {}  # kept alive, so that no two share an address
     groups = [module for module in net.modules() if isinstance(module, Layers)]

@@ -37,11 +37,8 @@ class ViewImages:
 def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
     """Find the image of every test view of every scene, by the scene's name.
 
-    Args:
-        folder: has a folder for each scene, named as the scene, with an image for each test view,
-            named as the view's photograph, or by the view's number in a scene without files. Other
-            images in it are ignored.
-        tasks: the scenes and their views.
+    `folder` has a folder for each scene, named as the scene, with an image for each test view,
+    named as the view's photograph or by its number (`view_names`); other images are ignored.
     """
     option, names = f"images={folder}", {task.sequence.name for task in tasks}
     if not folder.is_dir():
@@ -82,8 +79,7 @@ def view_names(task: Task) -> list[str]:
         return [f"{index:05d}" for index in targets]
     names = [PurePosixPath(str(image.file)).stem for image in sequence.scene.images]
     counts = Counter(names)
-    twice = {names[index] for index in targets if counts[names[index]] > 1}
-    if twice:
+    if twice := {names[index] for index in targets if counts[names[index]] > 1}:
         raise InputError(
             f"{sequence.name} has several photographs named {list_names(twice)}, in different "
             "folders: rename them, so that their renderings can be told apart."

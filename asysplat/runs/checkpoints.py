@@ -32,8 +32,6 @@ def find_checkpoint(
     Args:
         ckpt_path: None, a file, or "last" for the last one of the newest run below `runs`.
         run: the run's own folder; if it or one of its stages has checkpoints, it was interrupted.
-        runs: folder of all runs of one name.
-        say: takes the path, and warnings.
     """
     if any(has_checkpoints(folder) for folder in (run, *run.glob("*/"))):
         path = newest_folder(run) / "checkpoints" / LAST
@@ -84,9 +82,9 @@ def _damage(path: Path) -> str | None:
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Read the metadata of a run's checkpoint; its weights stay on the disk.
+    """Read the metadata of a run's checkpoint, such as its configuration, `hyper_parameters`.
 
-    `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names.
+    `callbacks` are the states of the callbacks by their names. The weights stay on the disk.
     """
     try:
         return torch.load(path, map_location="meta", mmap=True, weights_only=True)
@@ -98,10 +96,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def config_diff(metadata: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
-    """List the options that differ from those of a checkpoint: the bits of the runs will differ.
-
-    `metadata` is the checkpoint's, see `read_metadata`, and `revision` that of the code.
-    """
+    """List what differs from a checkpoint with this metadata: the bits of the runs will differ."""
     before, current = flat_options(metadata.get("hyper_parameters", {})), flat_options(config)
     keys = [key for key in before.keys() & current.keys() if before[key] != current[key]]
     keys = [key for key in sorted(keys) if not key.startswith(WITHOUT_EFFECT)]
@@ -128,11 +123,10 @@ def check_checkpoint(path: Path, module: nn.Module) -> None:
         ) from error
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
     names = sorted(expected.keys() | shapes.keys())
-    pairs = [(name, shapes.get(name), expected.get(name)) for name in names]
     lines = [
-        f"{name} is {stored} there and {shape} here"
-        for name, stored, shape in pairs
-        if stored != shape
+        f"{name} is {shapes.get(name)} there and {expected.get(name)} here"
+        for name in names
+        if shapes.get(name) != expected.get(name)
     ]
     if not lines:
         return
@@ -150,16 +144,11 @@ def check_checkpoint(path: Path, module: nn.Module) -> None:
 
 
 def load_weights(path: str | None, module: nn.Module, option: str = "init_path") -> None:
-    """Load weights, but neither optimizer nor schedule.
-
-    Args:
-        path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
-    """
+    """Load the weights of a .ckpt or .safetensors file, or those in checkpoints/: "shipped"."""
     if path is None:
         return
     file = existing_weights(path, option)
-    damage = None if file.suffix == ".safetensors" else _damage(file)
-    if damage is not None:
+    if damage := None if file.suffix == ".safetensors" else _damage(file):
         raise InputError(f"{option}={path} {damage}: copy it again, or name another file.")
     check_checkpoint(file, module)
     if file.suffix == ".safetensors":
@@ -193,8 +182,7 @@ def atomic_save(values: object, path: Path) -> None:
     with atomic_write(path) as partial, open(partial, "wb") as file:
         try:
             torch.save(values, file)
-        except RuntimeError as error:
-            # The reason is hidden by torch.
+        except RuntimeError as error:  # torch hides the reason
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise

@@ -1,19 +1,28 @@
 """Find what evaluate.py measures: a finished run, a checkpoint or another system's scenes."""
 
+import glob
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
 from asysplat.ranges import Count, Positive, check_options, check_training
 from asysplat.runs.run_config import plain_options, read_config
-from asysplat.runs.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
-from asysplat.runs.systems import contents_below, describe_system
+from asysplat.runs.runs import (
+    RESULTS,
+    content_of,
+    describe_run,
+    find_runs,
+    folder_of,
+    hash_of,
+    name_of,
+)
+from asysplat.runs.summary import TESTED
 
 CHECKPOINT = "checkpoints/last.ckpt"
 SYSTEMS = ("gaussians", "images", "refinement")  # options for scenes that no network predicts
@@ -26,6 +35,10 @@ OWN_OPTIONS = (
 )
 # Their PLY files have positions divided by a quantile, and opacities that are no logits.
 UNREADABLE = ("pixelsplat", "mvsplat")
+SYSTEM = "evaluation/system"
+# Options of the data that choose the images of a test, and their size.
+IMAGES = ("inputs", "targets", "height", "width", "selection")
+IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
 
 
 @dataclass(frozen=True)
@@ -155,3 +168,43 @@ def _check_new(folder: Path, options: DictConfig) -> None:
             f"write_gaussians={folder} exists and is not an empty folder: name a new one, "
             "nothing is overwritten."
         )
+
+
+def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a system, of scenes `made_of` something, and what it is measured on."""
+    tested = options_of_test(config, config.data.name)
+    return {
+        SYSTEM: system,
+        "evaluation/made_of": hash_of(made_of),
+        **{f"{TESTED}{key}": value for key, value in tested.items()},
+    }
+
+
+def contents_below(path: Path) -> dict[str, Any]:
+    """Return the content of a file, with its cameras, or of the files of a folder of scenes."""
+    folder, stem = path, "*"
+    if path.is_file():
+        folder, stem = path.parent, glob.escape(path.stem)
+    patterns = (f"{stem}.*", f"{stem}/*.*", f"{stem}/*/*/*")  # Gaussians, images, a COLMAP model
+    files = [file for pattern in patterns for file in folder.glob(pattern) if file.is_file()]
+    return {str(file.relative_to(folder)): content_of(file) for file in files}
+
+
+def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
+    """Return the options that the numbers of a test set depend on, whatever is measured on it.
+
+    They are the data, its images and their size, and the metrics; missing values are left out.
+    """
+    data = plain_options(config.data)
+    changes = (data["test_sets"] or {}).get(test_set) or {}
+    if data.get("test_size"):
+        data["height"], data["width"] = data["test_size"]
+    data["root"] = data.get("test_root") or data.get("root")
+    data |= changes
+    options = {key: value for key, value in data.items() if key in IMAGES}
+    options["data"] = test_set if "root" in changes else data["name"]
+    options["root"] = name_of(data["root"])
+    options["index"] = content_of(data.get("index"))
+    metrics = plain_options(config.metrics)
+    options |= {f"metrics.{key}": value for key, value in metrics.items() if key != "_target_"}
+    return {key: value for key, value in options.items() if value not in (None, MISSING)}

@@ -37,10 +37,9 @@ CODE = ("asysplat", "conf", "train.py")
 
 @cache
 def revision() -> str:
-    """Return the git commit of the code that this process runs.
+    """Return the git commit of the code that this process runs, or the version outside of git.
 
-    If tracked files of CODE differ from the commit, "+" and a hash of the differences follow. A
-    package outside a repository of its own gives its version instead.
+    If tracked files of CODE differ from the commit, "+" and a hash of the differences follow.
     """
     commit = _git("rev-parse", "--short=12", "HEAD")
     changes = _git("diff", "HEAD", "--", *CODE)

@@ -43,12 +43,8 @@ NOT_HASHED = (
     *("allow_missing_losses", "training.loss.allow_missing"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
-    *(
-        "trainer.num_sanity_val_steps",
-        "data.micro_batch",
-        "training.checkpoint_layers",
-        "training.views_at_once",
-    ),
+    *("trainer.num_sanity_val_steps", "data.micro_batch"),
+    *("training.checkpoint_layers", "training.views_at_once"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
@@ -73,10 +69,7 @@ class Run:
 
 
 def config_hash(config: DictConfig, earlier: Sequence[DictConfig] | None = None) -> str:
-    """Hash the resolved configuration, without the seed and the keys that change no number.
-
-    See `hashed_options`. Runs of one hash, seed and `data_of` have the same numbers.
-    """
+    """Hash the `hashed_options`: runs of one hash, seed and `data_of` have the same numbers."""
     return hash_of(hashed_options(config, earlier))
 
 
@@ -85,9 +78,8 @@ def hashed_options(
 ) -> dict[str, Any]:
     """Return the resolved options of a run that change its numbers, other than its seed.
 
-    Left out are NOT_HASHED, the number of loader processes, and further test sets. Of the test
-    root, disparities and a checkpoint to start from, only whether they are given is returned.
-    Missing values (`???`) are allowed.
+    Of the test root, disparities and a checkpoint to start from, only whether they are given is
+    returned. Missing values (`???`) are allowed.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
@@ -111,9 +103,7 @@ def hashed_options(
 def data_of(config: DictConfig) -> dict[str, str]:
     """Describe the data that a run reads, wherever it is on disk, as in metrics.json.
 
-    run/data/root and run/data/test_root are the names of those folders. run/data/index and
-    run/init_path are hashes of these files' content. run/test_sets/<name> is a hash of a further
-    test set's options, with its root by name and its index by content. Absent options are left out.
+    By the names of folders and the hashes of files' contents. Absent options are left out.
     """
     data = plain_options(config.data)
     described = {
@@ -184,10 +174,7 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 
 def find_reconstructions(logs: Path) -> list[Path]:
-    """Return the folders of the finished reconstructions below `logs` that left a scene.
-
-    Oldest first.
-    """
+    """Return the folders of the finished reconstructions below `logs` that left a scene."""
     folders = (path.parent for path in files_below(logs, RESULTS))
     return [folder for folder in folders if (folder / SCENE).exists()]
 
@@ -200,12 +187,9 @@ def files_below(folder: Path, name: str) -> list[Path]:
 def folder_of(
     run: object, logs: Path, find: Callable[[Path], list[Path]], files: Sequence[str]
 ) -> Path:
-    """Return the folder of a finished run.
+    """Return the folder of a finished run, which must have these files.
 
-    Args:
-        logs: folder in which "last" is searched.
-        find: function that returns the folders of the finished runs below a folder, oldest first.
-        files: names of files that the folder must have.
+    "last" is the last of those that `find` returns below `logs`.
     """
     folder = Path(str(run))
     if run == "last":
@@ -226,7 +210,7 @@ def folder_of(
 def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:
     """Return the options that a run and a configuration have with other values: (run, config).
 
-    Keys are dotted, those with fewer dots first; empty if the run's configuration is not readable.
+    Keys with fewer dots come first; empty if the run's configuration is not readable.
     """
     before = _options_of(run.folder)
     current = flat_options(hashed_options(config, ()))

@@ -18,18 +18,15 @@ STAGE_RECORD = "StageRecord"  # the callback in whose state a checkpoint names i
 def stage_configs(config: DictConfig) -> list[DictConfig]:
     """List the configurations of a run's stages, in their order; the last is the run's own.
 
-    Optimizer, schedule and random numbers start anew in each stage. All are tested at the size of
-    the last, so that their numbers can be compared.
+    All are tested at the size of the last, so that their numbers can be compared.
     """
     names = [*(config.get("earlier_stages") or ()), config.stage]
     size = config.data.test_size or [config.data.height, config.data.width]
     configs = []
     for index, name in enumerate(names):
         if name not in config.stages:
-            raise InputError(
-                f"earlier_stages names {name}, which is unknown: choose of "
-                f"{', '.join(config.stages)}."
-            )
+            known = ", ".join(config.stages)
+            raise InputError(f"earlier_stages names {name}, which is unknown: choose of {known}.")
         if name in names[:index]:
             raise InputError(
                 f"{name} is twice among the stages of the run, {', '.join(names)}: leave it out of "

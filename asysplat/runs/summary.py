@@ -70,8 +70,7 @@ def describe_costs(results: Results) -> str:
 def print_summary(results: Results, data: str, folder: Path) -> None:
     """Print the test and its baselines, the costs, the figures and, last, the run's folder.
 
-    Args:
-        data: the test set to print in full, each stage in a row; of others only PSNR is printed.
+    The test set `data` in full, each stage in a row; of others only PSNR.
     """
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
@@ -87,13 +86,11 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         ]
         title = f"test scenes: {data}, metrics: {results['protocol/name']}"
         print_table(console, ["", *(METRICS[name] for name in metrics)], rows, title)
-    other_sets = [name for name in test_sets if name != data]
-    if other_sets:
-        psnrs = {
-            name: [results[f"{method.format(name)}/psnr"] for method in ROWS.values()]
+    if other_sets := [name for name in test_sets if name != data]:
+        rows = [
+            [name, *_cells(results[f"{method.format(name)}/psnr"] for method in ROWS.values())]
             for name in other_sets
-        }
-        rows = [[name, *_cells(values)] for name, values in psnrs.items()]
+        ]
         print_table(console, ["", *ROWS], rows, "other test sets, PSNR (dB)")
     if costs := describe_costs(results):
         print(costs)

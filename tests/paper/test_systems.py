@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from asysplat.runs.systems import options_of_test
+from asysplat.runs.evaluation_target import options_of_test
 from paper.fill import fill_table
 from paper.markdown import render_markdown
 from paper.systems import find_systems

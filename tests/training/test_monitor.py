@@ -12,13 +12,9 @@ from lightning.pytorch.loggers import wandb
 from lightning_utilities.core.imports import RequirementCache
 from torch import nn
 
-from asysplat.evaluation import measured_cost
-from asysplat.evaluation.measured_cost import peak_flops
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms
 from asysplat.training.module import SplattingModule
-
-CPU = torch.device("cpu")
 
 
 def test_rates_are_those_of_all_steps_but_not_of_validations(monkeypatch):
@@ -26,7 +22,7 @@ def test_rates_are_those_of_all_steps_but_not_of_validations(monkeypatch):
     monkeypatch.setattr(monitor.time, "perf_counter", lambda: clock.now)
     logger = SimpleNamespace(log_metrics=lambda numbers, step: logged.update({step: numbers}))
     trainer = Mock(lightning.Trainer, global_step=0, world_size=2, loggers=[logger])
-    module = Mock(SplattingModule, device=CPU, net=nn.ModuleDict())
+    module = Mock(SplattingModule, device=torch.device("cpu"), net=nn.ModuleDict())
     views = [SimpleNamespace(num_views=count) for count in (3, 2)]
     batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
     watch = TrainingMonitor(every=2)
@@ -51,18 +47,6 @@ def test_gradient_norms_by_part():
     net["geometry"].bias.grad = torch.tensor([4.0])
     net["head"].bias.grad = torch.tensor([-2.0])
     assert gradient_norms(net) == {"gradient/geometry": 5, "gradient/head": 2}
-
-
-def test_the_peak_is_known_for_listed_gpus(monkeypatch):
-    gpu = torch.device("cuda")
-    assert peak_flops(CPU, "32-true") is None
-    monkeypatch.setattr(measured_cost.torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
-    assert peak_flops(gpu, "bf16-mixed") == pytest.approx(989.4e12)
-    assert peak_flops(gpu, "32-true") == pytest.approx(66.9e12)
-    monkeypatch.setattr(measured_cost.torch, "get_float32_matmul_precision", lambda: "high")
-    assert peak_flops(gpu, "32-true") == pytest.approx(494.7e12)
-    monkeypatch.setattr(measured_cost.torch.cuda, "get_device_name", lambda _: "another")
-    assert peak_flops(gpu, "bf16-mixed") is None
 
 
 def test_error_without_wandb(monkeypatch, composed):
