@@ -25,8 +25,8 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def check_command(script: str) -> DictConfig | None:
     """Check this process's command line and compose it; exit with the message on an error.
 
-    A script calls it before it imports torch, which takes seconds; --help needs none. Ctrl-C then
-    ends the process. A configuration of another folder is left to Hydra: None.
+    A script calls it before it imports torch, which takes seconds. Ctrl-C then ends the process. A
+    configuration of another folder is left to Hydra: None.
     """
     end_at_interrupt()
     os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
@@ -47,11 +47,7 @@ def check_command(script: str) -> DictConfig | None:
 def command(
     script: str, stopped: str = "stopped."
 ) -> Callable[[Callable[[DictConfig], object]], Callable[[], object]]:
-    """Return a decorator that makes a function of a configuration the command of a script.
-
-    The command composes conf/<script>.yaml with the options of the command line and calls the
-    function; `exit_with_message` says how it ends.
-    """
+    """Return a decorator that makes a function of conf/<script>.yaml the command of a script."""
 
     def decorate(function: Callable[[DictConfig], object]) -> Callable[[], object]:
         @hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")
@@ -81,8 +77,7 @@ def exit_with_message(stopped: str) -> Iterator[None]:
     except (Exception, KeyboardInterrupt) as error:
         message = stopped
         if not isinstance(error, KeyboardInterrupt):
-            summary = error_message(error)
-            if summary is None:
+            if (summary := error_message(error)) is None:
                 raise
             message = f"error: {summary}"
         # A second Ctrl-C would abort the interpreter, a lost loader print a traceback.
@@ -92,12 +87,8 @@ def exit_with_message(stopped: str) -> Iterator[None]:
 
 
 def error_message(error: BaseException) -> str | None:
-    """Return a sentence for an InputError, a full disk or memory, or a lost process; else None.
-
-    `error` may also have been raised from one of them.
-    """
-    mistake = input_error_behind(error)
-    if mistake is not None:
+    """Return a sentence for an InputError, a full disk or memory, or a lost process; else None."""
+    if (mistake := input_error_behind(error)) is not None:
         return str(mistake)
     cause: BaseException | None = error
     while cause is not None:

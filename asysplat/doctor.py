@@ -8,7 +8,6 @@ import platform
 import re
 import shutil
 import sys
-from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +32,10 @@ EXTRAS = {
 def main() -> None:
     """Print the machine, the versions and the missing parts; exit with 1 if one is required."""
     missing = sorted(str(needed) for needed in requirements() if not is_installed(needed))
-    lines = describe() | dict(optional_parts())
+    lines = describe()
+    for extra, purpose in EXTRAS.items():
+        installed = all(map(is_installed, requirements(extra) - requirements()))
+        lines[extra] = purpose if installed else f"pip install 'asysplat[{extra}]': {purpose}"
     width = max(map(len, lines))
     for name, text in lines.items():
         print(f"{name:{width}}  {text}".rstrip())
@@ -44,11 +46,14 @@ def main() -> None:
 def describe() -> dict[str, str]:
     """Describe the project's copy, Python, torch, the processor, the memory and the GPUs."""
     cache, home = Path.home() / ".cache" / "asysplat", shutil.disk_usage(Path.home())
+    info = Path("/proc/cpuinfo")  # Linux alone
+    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
+    processor = model[1] if model else platform.processor() or platform.machine()
     lines = {
         "asysplat": f"{__version__}, {revision()}, in {ROOT}",
         "python": f"{platform.python_version()}, {sys.executable}",
         "system": platform.platform(),
-        "processor": f"{processor()}, {os.cpu_count()} cores",
+        "processor": f"{processor}, {os.cpu_count()} cores",
         "disk": f"{home.free / 1e9:.0f} GB free at home; compiled kernels are in {cache}",
     }
     if find_spec("torch") is None:
@@ -70,20 +75,6 @@ def describe() -> dict[str, str]:
             f"{card.major}.{card.minor}, CUDA {torch.version.cuda}"
         )
     return lines
-
-
-def processor() -> str:
-    """Return the processor's name."""
-    info = Path("/proc/cpuinfo")  # Linux alone
-    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
-    return model[1] if model else platform.processor() or platform.machine()
-
-
-def optional_parts() -> Iterator[tuple[str, str]]:
-    """Yield each extra, and what it is for, with the line that installs it where it is missing."""
-    for extra, purpose in EXTRAS.items():
-        installed = all(map(is_installed, requirements(extra) - requirements()))
-        yield extra, purpose if installed else f"pip install 'asysplat[{extra}]': {purpose}"
 
 
 def requirements(extra: str = "") -> set[Requirement]:

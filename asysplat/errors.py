@@ -9,10 +9,9 @@ MAX_CHARACTERS = 500  # of another error's in a message
 
 
 class InputError(ValueError):
-    """Invalid input of a user.
+    """Invalid input of a user, in a sentence, which scripts print without a traceback.
 
-    The message is one sentence: the field or file, what was found, what is expected, and how to fix
-    it. Scripts print it without a traceback.
+    It says the field or file, what was found, what is expected, and how to fix it.
     """
 
 
@@ -22,10 +21,7 @@ def list_names(names: Collection[str]) -> str:
 
 
 def input_error_behind(error: BaseException) -> InputError | None:
-    """Return the InputError that `error` is or was raised from, or None.
-
-    Hydra wraps the errors of constructors that it calls; pydantic raises a ValidationError.
-    """
+    """Return the InputError that `error` is or was raised from, by Hydra or pydantic, or None."""
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
         if type(seen).__name__ == "ValidationError":  # by name: pydantic may not be loaded
@@ -40,8 +36,7 @@ def input_error_behind(error: BaseException) -> InputError | None:
 def first_mistake(error: Any, title: str | None = None) -> InputError:
     """Return the first mistake that a ValidationError of pydantic lists, as a sentence.
 
-    Args:
-        title: the name of the option that was checked; None: that of a dataclass of options.
+    `title` is the name of the option that was checked; None: that of a dataclass of options.
     """
     first = error.errors()[0]
     if "error" in first.get("ctx", {}):  # raised by a dataclass itself

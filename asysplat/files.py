@@ -18,8 +18,8 @@ from asysplat.errors import InputError
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder to write to, then move it to `path`.
 
-    The file is synced to disk before. Any exception, KeyboardInterrupt too, leaves `path` unchanged
-    and no temporary file. A link is replaced, and what it names stays.
+    Any exception, KeyboardInterrupt too, leaves `path` unchanged and no temporary file. A link is
+    replaced, and what it names stays.
     """
     target = Path(path).absolute()
     if target.exists() and not target.is_file():
@@ -46,13 +46,11 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 def make_folder(path: Path, option: str) -> None:
     """Create a folder if there is none."""
-    reason = None
     try:
         path.mkdir(parents=True, exist_ok=True)
+        reason = None if os.access(path, os.W_OK) else os.strerror(errno.EACCES)
     except OSError as error:
         reason = error.strerror
-    if reason is None and not os.access(path, os.W_OK):
-        reason = os.strerror(errno.EACCES)
     if reason is not None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
 

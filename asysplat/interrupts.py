@@ -11,10 +11,9 @@ MIN_SECONDS = 1.0  # between two interrupts
 
 
 def handle_signals() -> None:
-    """Set the signal handlers of a script; call it after its imports.
+    """Set the signal handlers of a script, after its imports: pycolmap would print a stack trace.
 
-    SIGTERM ends the process without the stack trace that pycolmap would print. SIGHUP, of a
-    terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`).
+    SIGHUP, of a terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`).
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

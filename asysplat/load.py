@@ -1,7 +1,4 @@
-"""Load a trained network by the name of its file: `asysplat.load("shipped")`.
-
-Import it from the package, `from asysplat import load`: the module has the name of the function.
-"""
+"""Load a trained network by the name of its file: `asysplat.load("shipped")`."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext

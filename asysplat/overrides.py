@@ -23,9 +23,7 @@ MIN_SIMILARITY = 0.8  # difflib's ratio of widht and width
 def check_overrides(overrides: Iterable[str], script: str = "train") -> DictConfig:
     """Compose a configuration; the error of an unknown option or choice names the nearest.
 
-    Args:
-        overrides: `key=value`, in Hydra's syntax; Hydra's own options are not checked. Of a sweep
-            each value is composed once, with some values of the others.
+    Of a sweep each value is composed once, with some of the others; Hydra's options are left out.
     """
     parsed = [_parse(word) for word in overrides if not word.lstrip("+~").startswith("hydra")]
     lines = [values for values in map(_values, parsed) if values]

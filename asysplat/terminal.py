@@ -13,10 +13,7 @@ UNLIMITED = 10_000  # characters
 
 
 def make_console(stderr: bool = False) -> Console:
-    """Make a console that prints names as they are: a "[b]" or ":x:" in a file name is no markup.
-
-    It prints to the standard output, or to `stderr`.
-    """
+    """Make a console that prints names as they are: "[b]" or ":x:" in a file name is no markup."""
     return Console(stderr=stderr, markup=False, emoji=False)
 
 
@@ -28,14 +25,7 @@ def print_table(
     box: Box = HEAVY_HEAD,
     first: Collection[int] = (),
 ) -> None:
-    """Print a table; columns that do not fit beside the others follow in a table below.
-
-    The first column names the rows, and stands in each of these tables. A word is broken only if it
-    is longer than a line.
-
-    Args:
-        headings: titles of the columns.
-    """
+    """Print a table; columns that do not fit follow in tables below, beside the first again."""
 
     def part(numbers: Sequence[int]) -> Table:
         table = Table(box=box, title=title if numbers[1] == 1 else None)

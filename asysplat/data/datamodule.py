@@ -151,7 +151,6 @@ class SceneDataModule(lightning.LightningDataModule):
 
     @contextmanager
     def _naming(self, test_set: str) -> Generator[None]:
-        """Name a further test set in the InputErrors of the body."""
         try:
             yield
         except InputError as error:
@@ -231,10 +230,7 @@ class SceneDataModule(lightning.LightningDataModule):
 
 
 class TrainingTasks(Dataset):
-    """An endless list of training tasks; task i is drawn with its own generator.
-
-    A sample's `bad_scenes` are the errors of scenes that were drawn before and cannot be used.
-    """
+    """An endless list of training tasks; task i is drawn with its own generator."""
 
     def __init__(self, data: SceneDataModule):
         self.source, self.seed = data.source, data.seed

@@ -54,10 +54,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class ProceduralSource:
-    """Synthetic scenes: unlimited ones to train, and fixed ones to validate and test.
-
-    Splits share no seeds. See FilesSource for the windows.
-    """
+    """Synthetic scenes: unlimited ones to train, and fixed ones to validate and test."""
 
     height: int
     width: int
@@ -122,30 +119,22 @@ class FilesSource:
     all their images; test scenes are never trained on, even if `root` holds them as well. Without a
     `test_root`, in every scene of `root` the first of every 8 images tests, the fifth validates,
     and the others train.
-
-    Args:
-        root, test_root: one scene, or a folder of scenes.
-        window: least and greatest number of consecutive images that a training task is drawn from;
-            None: all images.
-        first_window: window of the first task; None: `window`.
-        scenes: names of the folders that test; None: all.
-        selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
-            first_96 (its ablations), uniform, or index.
-        index: with selection=index, the file that names the images; scenes that it does not name
-            are not tested, and validation takes every_8th.
-        targets_may_be_inputs: whether a training task's targets may be among its inputs.
     """
 
-    root: str
+    root: str  # one scene, or a folder of scenes, as test_root
     options: SceneOptions
+    # Least and greatest number of consecutive images that a training task is drawn from; None: all.
     window: Sequence[int] | None
     test_root: str | None = None
-    scenes: Sequence[str] | None = None
+    scenes: Sequence[str] | None = None  # names of the folders that test; None: all
+    # every_8th, kmeans (the paper's tests), first_96 (its ablations), uniform, or index
     selection: str = "every_8th"
+    # With selection=index, the file that names images. Other scenes are not tested, and validation
+    # takes every_8th.
     index: str | None = None
     val_scenes: int = 8
-    targets_may_be_inputs: bool = False
-    first_window: Sequence[int] | None = None
+    targets_may_be_inputs: bool = False  # in training
+    first_window: Sequence[int] | None = None  # of the first task; None: `window`
 
     def __post_init__(self):
         self.split_by_scenes = self.test_root is not None

@@ -32,10 +32,7 @@ def wait_for(device: torch.device) -> None:
 
 
 class CostMeter:
-    """Measures seconds and peak memory from each `start` to its `stop`.
-
-    All meters share the process's peak, so their intervals must not overlap.
-    """
+    """Measures seconds and peak memory from each `start` to its `stop`; none may overlap."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -62,10 +59,7 @@ def memory_gb(device: torch.device | str) -> float:
 
 
 def reset_peak_memory(device: torch.device | str) -> bool:
-    """Reset the peak that `peak_memory_gb` reads; return whether it could be.
-
-    On CUDA it can, and on Linux if /proc is writable.
-    """
+    """Reset the peak that `peak_memory_gb` reads, if it can be: on CUDA, and mostly on Linux."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         return True

@@ -99,10 +99,7 @@ class Protocol:
         lpips: nn.Module | None,
         psnr_only: bool = False,
     ) -> list[dict[str, float]]:
-        """Compute the metrics of each view by itself, as SSIM of many takes much memory.
-
-        Without depths only images are measured.
-        """
+        """Compute the metrics of each view by itself, as SSIM of many takes much memory."""
         rows = []
         for view in range(targets.num_views):
             image, target = rendered[[view]], targets.select([view])

@@ -199,7 +199,6 @@ def orbit(
 def _looks(
     centers: Float[ndarray, "T 3"], forward: Float[ndarray, "T 3"], up: Float[ndarray, "3"]
 ) -> Float[ndarray, "T 4 4"]:
-    """Return upright poses that look forward."""
     right = np.cross(forward, up)
     axes = np.stack((right, np.cross(forward, right), forward), 2)
     poses = np.tile(np.eye(4), (len(centers), 1, 1))
@@ -209,10 +208,7 @@ def _looks(
 
 
 def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
-    """Return what is perpendicular to all x axes, as photographers keep the horizon level.
-
-    If these are parallel, return the cameras' mean up.
-    """
+    """Return what is perpendicular to all x axes, as horizons are level; else the mean up."""
     right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
     if np.linalg.norm(up) < ROUNDING:  # they cancel
         up = -poses[middle, :3, 1]

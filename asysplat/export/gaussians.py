@@ -145,7 +145,6 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, notes: Notes = NO_NO
 
 
 def _metadata(notes: Notes) -> dict[str, str]:
-    """Write an offset that is not 0, a background that is known, and antialiasing."""
     numbers = {"offset": notes.offset if any(notes.offset) else (), "background": notes.background}
     numbers["antialiased"] = (1,) if notes.antialiased else ()
     return {name: " ".join(map(repr, values)) for name, values in numbers.items() if values}

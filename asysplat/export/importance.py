@@ -27,10 +27,7 @@ def blending_weights(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "N
 
 
 def most_important(gaussians: Gaussians, fraction: float, cameras: Cameras | None) -> Gaussians:
-    """Keep a fraction of the Gaussians: those with the largest blending weights, in their order.
-
-    Without cameras, opacity times area stands for the weight.
-    """
+    """Keep the Gaussians of largest blending weights, or opacity times area, in their order."""
     if cameras is None:
         weights = gaussians.opacities * gaussians.scales.sort(-1).values[:, 1:].prod(-1)
     else:
@@ -48,16 +45,11 @@ COMPARED_VIEWS = 8
 def picture_psnr(before: Gaussians, after: Gaussians, cameras: Cameras, notes: Notes) -> float:
     """Compute the mean PSNR of one scene's pictures against another's, at up to 8 cameras."""
     background = torch.tensor(notes.background) if notes.background else None
+    options = {"depth": False, "antialiased": notes.antialiased}
     count = min(COMPARED_VIEWS, cameras.num_views)
     values = []
     for view in torch.linspace(0, cameras.num_views - 1, count).round().long().tolist():
-        images = [
-            render(
-                *(scene, cameras.select([view]), background),
-                depth=False,
-                antialiased=notes.antialiased,
-            ).image.clamp(0, 1)
-            for scene in (after, before)
-        ]
-        values.append(psnr(*images).mean().item())
+        camera, scenes = cameras.select([view]), (after, before)
+        images = (render(scene, camera, background, **options).image for scene in scenes)
+        values.append(psnr(*(image.clamp(0, 1) for image in images)).mean().item())
     return sum(values) / count

@@ -77,16 +77,14 @@ class SceneFile:
     ) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "V 4 4"]]:
         """Match poses to the data's by the names of their images, without folder and suffix."""
         images = self.sequence.scene.images if isinstance(self.sequence, FileSequence) else ()
-        file_poses = [(PurePosixPath(name).stem, pose) for name, pose in poses]
-        data_poses = [(PurePosixPath(str(image.file)).stem, image.cam_to_world) for image in images]
-        unique = [_unique(named) for named in (file_poses, data_poses)]
+        data_poses = [(str(image.file), image.cam_to_world) for image in images]
+        unique = [_by_stem(named) for named in (poses, data_poses)]
         names = sorted(unique[0].keys() & unique[1].keys())
         stacked = (np.array([named[name] for name in names], dtype=np.float64) for named in unique)
         source, target = (torch.tensor(stack).reshape(len(names), 4, 4) for stack in stacked)
-        distances = [poses[:, :3, 3].norm().item() for poses in (source, target)]
-        spreads = [_points(poses)[1] for poses in (source, target)]
         # Also where there is no camera, and the spread of none is NaN.
-        if not all(s > MIN_EXTENT * d for s, d in zip(spreads, distances, strict=True)):
+        pairs = ((_points(p)[1], p[:, :3, 3].norm().item()) for p in (source, target))
+        if not all(spread > MIN_EXTENT * distance for spread, distance in pairs):
             raise InputError(
                 f"{where} has {len(names)} of the {len(data_poses)} images of "
                 f"{self.sequence.name}, by their file names, in one place or none: give cameras of "
@@ -161,9 +159,11 @@ def world_origin(sequence: ImageSequence) -> tuple[float, float, float]:
     return sequence.scene.origin if isinstance(sequence, FileSequence) else (0.0, 0.0, 0.0)
 
 
-def _unique(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
-    counts = Counter(name for name, _ in named)
-    return {name: pose for name, pose in named if counts[name] == 1}
+def _by_stem(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
+    """Return the poses by names without folder and suffix that only one has."""
+    by_stem = [(PurePosixPath(name).stem, pose) for name, pose in named]
+    counts = Counter(stem for stem, _ in by_stem)
+    return {stem: pose for stem, pose in by_stem if counts[stem] == 1}
 
 
 def _points(poses: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "P 3"], float]:

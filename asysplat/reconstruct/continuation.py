@@ -17,11 +17,8 @@ OF_QUALITY = ("height", "views")  # those that quality= sets
 def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     """Take the photographs and the scene of the reconstruction `config.run`, which may be None.
 
-    The refinement then begins at full resolution. Nothing else is taken: a run may come from a
-    stranger.
-
-    Args:
-        options: names of the options on the command line, which stay.
+    The refinement then begins at full resolution. The options of the command line stay. Nothing
+    else is taken: a run may come from a stranger.
     """
     if config.run is None:
         return config

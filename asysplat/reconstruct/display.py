@@ -20,8 +20,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class RefinementDisplay:
     """Show a progress bar and, if given, a viewer; Ctrl-C ends the refinement after its step.
 
-    As a context manager it handles SIGINT and SIGTERM until its end: the second Ctrl-C interrupts,
-    while a scheduler or a closed terminal may send any number of signals.
+    The second Ctrl-C interrupts, while a scheduler or a closed terminal may send any number of
+    signals.
     """
 
     def __init__(self, viewer: Viewer | None = None):
@@ -55,9 +55,8 @@ class RefinementDisplay:
     def __call__(self, progress: RefinementProgress, refinement: Refining) -> bool:
         """Show the progress, and Gaussians that all views share; return whether to stop."""
         self.last = progress
-        text = (
-            f"step {progress.step}, PSNR {progress.psnr:.2f} dB, {progress.gaussians:,} Gaussians"
-        )
+        quality = f"PSNR {progress.psnr:.2f} dB"
+        text = f"step {progress.step}, {quality}, {progress.gaussians:,} Gaussians"
         self._bar.update(self._task, completed=progress.fraction, text=text)
         clock = time.monotonic()
         if not self._terminal and clock - self._printed > PRINT_SECONDS:

@@ -36,10 +36,7 @@ def check_video(video: DictConfig) -> None:
 
 
 def find_views(video: DictConfig, inputs: Sequence[str], held_out: Sequence[str]) -> list[int]:
-    """Find the views that the camera path passes, in its order, among the inputs and held-out ones.
-
-    A photograph is named by its file, or by the end of its path where files share a name.
-    """
+    """Find the views that the camera path passes, in its order, by the ends of their paths."""
     if isinstance(video.path, str):
         return list(range(len(inputs)))
     return [_find_view(name, [*inputs, *held_out]) for name in video.path]
@@ -61,9 +58,7 @@ def _find_view(name: str, files: Sequence[str]) -> int:
 def video_cameras(
     video: DictConfig, photographs: Photographs, scene: Gaussians | AnchorScene
 ) -> Cameras:
-    """Build the cameras of all frames, of the configured path and height.
-
-    An orbit needs Gaussians.
+    """Build the cameras of all frames, of the configured path and height; an orbit needs Gaussians.
 
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """

@@ -82,10 +82,7 @@ def _damage(path: Path) -> str | None:
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Read the metadata of a run's checkpoint, such as its configuration, `hyper_parameters`.
-
-    `callbacks` are the states of the callbacks by their names. The weights stay on the disk.
-    """
+    """Read a run's checkpoint, such as its `hyper_parameters`; its weights stay on the disk."""
     try:
         return torch.load(path, map_location="meta", mmap=True, weights_only=True)
     except Exception as error:

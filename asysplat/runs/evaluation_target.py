@@ -100,7 +100,6 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
 def _describe_source(
     system: str, options: DictConfig, overrides: Sequence[str]
 ) -> tuple[str, dict[str, Any]]:
-    """Return the name of another system, and what its scenes depend on."""
     if system == "refinement":
         keys = ("refinement_seconds", "refinement_steps")
         key = keys[options.refinement_steps is not None]
@@ -191,10 +190,7 @@ def contents_below(path: Path) -> dict[str, Any]:
 
 
 def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
-    """Return the options that the numbers of a test set depend on, whatever is measured on it.
-
-    They are the data, its images and their size, and the metrics; missing values are left out.
-    """
+    """Return the options of data and metrics that the numbers of a test set depend on."""
     data = plain_options(config.data)
     changes = (data["test_sets"] or {}).get(test_set) or {}
     if data.get("test_size"):

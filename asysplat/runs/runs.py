@@ -101,10 +101,7 @@ def hashed_options(
 
 
 def data_of(config: DictConfig) -> dict[str, str]:
-    """Describe the data that a run reads, wherever it is on disk, as in metrics.json.
-
-    By the names of folders and the hashes of files' contents. Absent options are left out.
-    """
+    """Describe the data that a run reads: names of folders, and hashes of files' contents."""
     data = plain_options(config.data)
     described = {
         "run/data/root": name_of(data.get("root")),
@@ -208,10 +205,7 @@ def folder_of(
 
 
 def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the options that a run and a configuration have with other values: (run, config).
-
-    Keys with fewer dots come first; empty if the run's configuration is not readable.
-    """
+    """Return the options of which a run and a configuration have other values, (run, config)."""
     before = _options_of(run.folder)
     current = flat_options(hashed_options(config, ()))
     keys = sorted(before.keys() & current.keys(), key=lambda key: (key.count("."), key))

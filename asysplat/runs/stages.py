@@ -16,10 +16,7 @@ STAGE_RECORD = "StageRecord"  # the callback in whose state a checkpoint names i
 
 
 def stage_configs(config: DictConfig) -> list[DictConfig]:
-    """List the configurations of a run's stages, in their order; the last is the run's own.
-
-    All are tested at the size of the last, so that their numbers can be compared.
-    """
+    """List the configurations of a run's stages, all tested at the size of the last, its own."""
     names = [*(config.get("earlier_stages") or ()), config.stage]
     size = config.data.test_size or [config.data.height, config.data.width]
     configs = []

@@ -68,10 +68,7 @@ def describe_costs(results: Results) -> str:
 
 
 def print_summary(results: Results, data: str, folder: Path) -> None:
-    """Print the test and its baselines, the costs, the figures and, last, the run's folder.
-
-    The test set `data` in full, each stage in a row; of others only PSNR.
-    """
+    """Print the results of a test set, of each stage, and the PSNR of others; costs; figures."""
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
     console = make_console()

@@ -57,8 +57,7 @@ class SplattingModule(lightning.LightningModule):
         freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
-        self.optimizer, self.matrix_optimizer = optimizer, matrix_optimizer
-        self.schedule = schedule
+        self.optimizer, self.matrix_optimizer, self.schedule = optimizer, matrix_optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
         self._parallel_scenes = ParallelScenes(net, self.scene_terms)
         self._accumulated = AccumulatedMetrics(net)
@@ -106,11 +105,8 @@ class SplattingModule(lightning.LightningModule):
         return terms["loss"]
 
     def compute_terms(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes.
-
-        On a CPU, copies of the network compute the scenes in parallel.
-        """
-        # The copies of a network whose parameters are sharded (FSDP) could not gather them.
+        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes."""
+        # In parallel on a CPU; copies of a network of sharded parameters could not gather them.
         on_cpu = self.device.type == "cpu" and self.device_mesh is None
         if on_cpu and len(batch["scene"]) > 1:
             return self._parallel_scenes(batch)
@@ -118,8 +114,7 @@ class SplattingModule(lightning.LightningModule):
 
     def scene_terms(self, batch: Batch, net: nn.Module) -> dict[str, Tensor]:
         """Compute the terms of scenes that one network predicts."""
-        prediction = self(batch, depth=self.loss.needs_depth, net=net)
-        targets = batch["targets"]
+        prediction, targets = self(batch, depth=self.loss.needs_depth, net=net), batch["targets"]
         image = targets.masked(prediction.rendering.image.detach())
         return {**self.loss(prediction, batch), "psnr": psnr(image, targets.images).mean()}
 
@@ -178,11 +173,7 @@ def block_matrices(net: nn.Module) -> list[nn.Parameter]:
 
 
 def freeze_unused(net: Network) -> None:
-    """Turn off the gradients of parameters that no Gaussian depends on.
-
-    Distributed processes would wait for those gradients forever. The parameters exist because the
-    paper counts them, such as a link into a branch from which nothing is predicted.
-    """
+    """Turn off gradients that no Gaussian depends on: processes would wait for them forever."""
     with torch.device("meta"):
         views = blank_views(2, net.patch, net.patch)
         state = {n: torch.empty_like(t, device="meta") for n, t in net.named_buffers()}
@@ -198,11 +189,7 @@ def freeze_unused(net: Network) -> None:
 
 
 class AccumulatedMetrics:
-    """Averages the terms of the loss and the running means of batch norms over an optimizer step.
-
-    Both equal those of one process with the whole batch. Every micro-batch starts from the same
-    running means.
-    """
+    """Averages the terms of the loss and the running means of batch norms over micro-batches."""
 
     def __init__(self, net: nn.Module):
         norms = [module for module in net.modules() if isinstance(module, _BatchNorm)]
@@ -211,12 +198,10 @@ class AccumulatedMetrics:
         self.updated: list[list[Tensor]] = []
 
     def start(self) -> None:
-        """Begin an optimizer step."""
         self.before = [buffer.clone() for buffer in self.buffers]
         self.terms, self.updated = [], []
 
     def add(self, terms: dict[str, Tensor]) -> None:
-        """Add a micro-batch after its forward pass."""
         self.terms.append({name: term.detach() for name, term in terms.items()})
         self.updated.append([buffer.clone() for buffer in self.buffers])
         self._set(self.before)

@@ -13,10 +13,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 
 def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaLR:
-    """Return the schedule of a linear warm-up to the optimizer's rate, then a cosine to 0.
-
-    The warm-up is part of the total; both are counted in optimizer steps.
-    """
+    """Return the schedule of a linear warm-up, part of the total, then a cosine to 0."""
 
     def factor(step: int) -> float:
         if step < warmup_steps:
@@ -28,10 +25,7 @@ def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaL
 
 
 class JointOptimizer(Optimizer):
-    """Steps optimizers of disjoint parameters as one, whose state and groups are those of all.
-
-    A schedule multiplies the rates of all groups; each group keeps its own rate.
-    """
+    """Steps optimizers of disjoint parameters as one, whose state and groups are those of all."""
 
     def __init__(self, *optimizers: Optimizer):
         self.optimizers = optimizers
@@ -49,7 +43,6 @@ class JointOptimizer(Optimizer):
         return loss
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load the state and the groups of all optimizers."""
         super().load_state_dict(state_dict)
         self._share()
 
@@ -78,7 +71,6 @@ class Muon(Optimizer):
         rms: root mean square of a step at learning rate 1; 0.2 is about that of AdamW's in a long
             training (Liu et al. 2025, "Muon is scalable", Eq. 4).
         momentum: decay of the mean of gradients; Nesterov's.
-        weight_decay: fraction of the learning rate by which weights shrink in a step.
     """
 
     def __init__(
@@ -94,7 +86,6 @@ class Muon(Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:
-        """Step every matrix that has a gradient."""
         for group in self.param_groups:
             lr, kept = group["lr"], 1 - group["lr"] * group["weight_decay"]
             same_shape: dict[torch.Size, list[Tensor]] = defaultdict(list)
@@ -117,10 +108,7 @@ class Muon(Optimizer):
 
 
 def orthogonalize(matrices: Float[Tensor, "K m n"]) -> Float[Tensor, "K m n"]:
-    """Compute U V^T of the singular value decompositions U S V^T, roughly: S becomes about 1.
-
-    By Newton-Schulz iterations, in bfloat16 on a GPU.
-    """
+    """Compute U V^T of the decompositions U S V^T, roughly, by Newton-Schulz iterations."""
     if matrices.shape[1] > matrices.shape[2]:
         return orthogonalize(matrices.mT).mT
     x = matrices.to(torch.bfloat16 if matrices.is_cuda else torch.float32)

@@ -36,10 +36,9 @@ class Prediction:
 
 
 class ParallelScenes:
-    """Computes means over the scenes of a batch, and their gradients.
+    """Computes means over the scenes of a batch of the terms of `compute`, and their gradients.
 
-    Batch norms normalize each scene by itself, as if it had its own process; their running means
-    change by the mean over the scenes. `compute` returns terms, "loss" among them.
+    Batch norms normalize each scene by itself, as if it had its own process.
     """
 
     def __init__(self, net: nn.Module, compute: Callable[[Batch, nn.Module], Terms]):
@@ -97,8 +96,7 @@ class ParallelScenes:
 class ShardedStrategy(ModelParallelStrategy):
     """Shards weights and batches among all processes of all nodes (FSDP2, also on CPUs).
 
-    `configure_model` of the module shards the weights. A checkpoint is one file with all of them,
-    which a single process can read too.
+    A checkpoint is one file with all weights, which a single process can read too.
     """
 
     def __init__(self):
@@ -114,11 +112,11 @@ def split(batch: Batch) -> list[Batch]:
     """Split a batch into batches of one scene."""
     scenes = []
     for index, scene in enumerate(batch["scene"]):
-        inputs, targets = (
-            views.map(lambda tensor, i=index: tensor[i, None])
-            for views in (batch["inputs"], batch["targets"])
-        )
-        scenes.append({**batch, "scene": [scene], "inputs": inputs, "targets": targets})
+        views = {
+            name: batch[name].map(lambda tensor, i=index: tensor[i, None])
+            for name in ("inputs", "targets")
+        }
+        scenes.append({**batch, "scene": [scene], **views})
     return scenes
 
 

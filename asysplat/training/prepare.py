@@ -58,7 +58,6 @@ class TrainingStage:
 
     @property
     def folder(self) -> Path:
-        """The stage's folder."""
         return Path(self.config.paths.run)
 
     def check(
@@ -95,10 +94,7 @@ class TrainingStage:
         }
 
     def begin(self, trainer: lightning.Trainer, data: SceneDataModule) -> None:
-        """Divide the batches between the processes, and write config.yaml.
-
-        Nothing is written before this call: a refused option leaves no folder.
-        """
+        """Divide the batches between the processes, and write config.yaml, before anything else."""
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
         resumes = has_checkpoints(self.folder)

@@ -23,8 +23,7 @@ MAX_NAME = 120  # characters; file systems allow 255 bytes
 def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     """Choose the folder of a run, for `hydra.run.dir` of conf/train.yaml.
 
-    An interrupted run resumes in its own folder. Other runs that start from a checkpoint, such as
-    more steps of a finished run, get the folder `new`. `runs` has all runs of one name.
+    An interrupted run, of those of one name in `runs`, resumes in its own folder; others get `new`.
     """
     if ckpt_path == "last":
         try:
@@ -46,9 +45,8 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
 def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
     """Name a job of a sweep by its options that vary, for `hydra.sweep.subdir` of conf/train.yaml.
 
-    Args:
-        params: `hydra.sweeper.params`. Options swept on the command line are read from sys.argv,
-            which a scheduler's processes lack; then every option is in the name.
+    `params` are `hydra.sweeper.params`. Options swept on the command line are read from sys.argv,
+    which a scheduler's processes lack; then every option is in the name.
     """
     command = dict(word.partition("=")[::2] for word in sys.argv[1:])
     assigned = {**(params or {}), **command}
@@ -61,11 +59,7 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
 
 @contextmanager
 def unused_removed(folder: Path) -> Generator[None]:
-    """Remove a run's folder if the body fails before the run has written to it.
-
-    So does a mistyped option; Hydra has written its configuration there. An empty folder around it
-    is removed, too.
-    """
+    """Remove a run's folder if the body fails before the run, but Hydra, has written to it."""
     try:
         yield
     except BaseException:

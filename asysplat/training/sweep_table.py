@@ -17,11 +17,7 @@ Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration,
 
 
 class SweepTable(Callback):
-    """Prints the jobs of a sweep after the last: the options that vary and the test's metrics.
-
-    It reads what Hydra and the runs write to disk, so that jobs of every launcher are in it. After
-    a failure or an interruption it prints how to resume.
-    """
+    """Prints the jobs of a sweep after the last: the options that vary and the test's metrics."""
 
     def __init__(self):
         self.complete = False
@@ -52,7 +48,6 @@ def read_jobs(folder: Path, logs: Path) -> list[Job]:
 
 
 def _number(path: Path) -> int:
-    """Return the number of the job whose folder has `path`."""
     return int(path.parent.name.partition("_")[0])
 
 

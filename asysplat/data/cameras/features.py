@@ -89,7 +89,6 @@ def match_photographs(
 
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the pairs of photographs to match; `names` in the order of the sequence."""
     if len(names) <= ALL_PAIRS:
         return list(combinations(names, 2))
     gaps = {*range(1, FOLLOWING + 1)} | {2**k for k in range(4, len(names).bit_length())}

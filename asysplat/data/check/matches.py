@@ -162,10 +162,7 @@ def epipolar_distances(cameras: Cameras, matches: Matches) -> Float[Tensor, " M"
 def triangulate(
     cameras: Cameras, matches: Matches
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, " M"]]:
-    """Triangulate each match at the nearest points of its two rays.
-
-    Returns the depths along both cameras' z axes, and the angle between the rays, in degrees.
-    """
+    """Return the depths of matches along both cameras' z axes, and their rays' angle in degrees."""
     baseline = _baseline(cameras, matches)
     # Normal equations of |x first - y second - baseline|.
     first, second = _rays(cameras, matches).unbind(1)

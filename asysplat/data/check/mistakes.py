@@ -39,10 +39,7 @@ class Mistake:
 
 
 def common_mistakes(names: Sequence[str]) -> list[Mistake]:
-    """List the common mistakes, the most likely first; `names` are the image files, in order.
-
-    Mistakes with a factor to fit are not listed: see `other_resolution` and `other_focal`.
-    """
+    """List the mistakes without a factor to fit, the most likely first; `names` are the images'."""
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
     exchange = "exchange them, and check whether the photographs were turned to stand upright"
     exchanged = {
@@ -126,18 +123,16 @@ def _swapped_axes() -> list[Mistake]:
         else:
             negative = (axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
             name = f"the cameras' {' and '.join(negative)} point the wrong way"
-        fix = f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
-        fix += ", ".join(EXPECTED)
+        columns_read, columns_right = ", ".join(columns), ", ".join(EXPECTED)
+        fix = f"the columns of cam_to_world as read point {columns_read}; make them {columns_right}"
         if mirror < 0:
             fix += ", and mirror the positions as well, since the world is left-handed"
-
-        def correct(
-            r: Tensor, c: Tensor, turn: Tensor = turn, mirror: Tensor = mirror
-        ) -> tuple[Tensor, Tensor]:
-            return mirror * r @ turn, mirror * c
-
-        mistakes.append(_pose_mistake(name, fix, correct))
+        mistakes.append(_pose_mistake(name, fix, partial(_turned, turn, mirror)))
     return mistakes
+
+
+def _turned(turn: Tensor, mirror: Tensor, r: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    return mirror * r @ turn, mirror * c
 
 
 def _orders(names: Sequence[str]) -> list[Mistake]:
@@ -157,14 +152,12 @@ def _orders(names: Sequence[str]) -> list[Mistake]:
         name = f"every pose belongs to the image {distance} {'later' if offset > 0 else 'earlier'}"
         orders[name] = [(index + offset) % len(indices) for index in indices]
 
-    def reorder(cameras: Cameras, order: list[int]) -> Cameras:
-        # Pose k as read belongs to image order[k].
-        return cameras.select(torch.tensor(order).argsort())
-
+    # Pose k as read belongs to image order[k].
+    places = {name: torch.tensor(order).argsort() for name, order in orders.items()}
     return [
-        Mistake(name, "give every image its own pose", partial(reorder, order=order))
-        for name, order in orders.items()
-        if order != list(indices)
+        Mistake(name, "give every image its own pose", lambda c, p=place: c.select(p))
+        for name, place in places.items()
+        if place.tolist() != list(indices)
     ]
 
 

@@ -190,10 +190,7 @@ def read_pixels(
 
 
 def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, int]:
-    """Compare depth maps with precisely triangulated matches.
-
-    Returns the median of stored over triangulated depths, and the number of points compared.
-    """
+    """Return the median of stored over precisely triangulated depths, and the number compared."""
     cameras = sequence.cameras.to(torch.float64)
     depths, angles = triangulate(cameras, matches)
     precise = (angles > MIN_DEPTH_ANGLE) & (depths > 0).all(-1)

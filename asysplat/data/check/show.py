@@ -40,10 +40,7 @@ def print_report(report: Report, title: str, console: Console) -> None:
 
 
 def draw_report(report: Report, title: str) -> Figure:
-    """Draw the path from above and from the side, and a few pairs of images below.
-
-    With matched points and the epipolar lines that the cameras predict for them.
-    """
+    """Draw the path from two sides, and pairs of images with matches and epipolar lines."""
     cameras = report.sequence.cameras
     image_height = min(WIDTH / MAX_PAIRS * cameras.height / cameras.width, MAX_IMAGE_HEIGHT)
     pair_height = 2 * (image_height + TITLE_HEIGHT)

@@ -40,7 +40,6 @@ def polish(plan: FloorPlan, rng: Generator) -> None:
 
 
 def _near_walk(plan: FloorPlan, rng: Generator) -> Float[np.ndarray, "K 2"]:
-    """Draw spots 0.6 to 1.5 m from points of the path."""
     angle = rng.uniform(0, 2 * np.pi, TRIES)
     offset = rng.uniform(0.6, 1.5, TRIES) * np.array([np.cos(angle), np.sin(angle)])
     return plan.walk[rng.integers(len(plan.walk), size=TRIES)] + offset.T

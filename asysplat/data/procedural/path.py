@@ -46,10 +46,7 @@ def circle(rng: Generator, time: Times, radius: float) -> tuple[Points, Points]:
 
 
 def above(rng: Generator, time: Times, radius: float) -> tuple[Points, Points]:
-    """Draw a path of 90 to 270 degrees around a low object, at 0.25 to 0.5 times `radius`.
-
-    Cameras look down from close by, as when an object is photographed and not a place.
-    """
+    """Draw a path of 90 to 270 degrees around a low object, at 0.25 to 0.5 times `radius`."""
     angle = _turn(rng, time, 90.0, 270.0, 0.03)
     distance = radius * rng.uniform(0.25, 0.5) * (1 + 0.15 * sway(rng, time, 0.7, 1.6))
     positions = _at_hand_height(rng, time, distance * _direction(angle))
@@ -111,10 +108,7 @@ def _along_gaze(rng: Generator, positions: Points, gaze: Times) -> Points:
 def hand_held_path(
     rng: Generator, num_images: int, radius: float, path: Path = arc
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Draw OpenCV camera-to-world matrices along a path, with tremble and a slight roll.
-
-    `num_images` samples the same path more or less finely.
-    """
+    """Draw OpenCV camera-to-world matrices along a path, with tremble and a slight roll."""
     time = np.linspace(0, 1, num_images)
     positions, targets = path(rng, time, radius)
     positions = positions + np.stack([0.01 * sway(rng, time, 7.0, 11.0) for _ in range(3)], 1)

@@ -185,10 +185,7 @@ def albedo(
     uv: Float[Tensor, "2 R"],
     footprint: Float[Tensor, " R"],
 ) -> Float[Tensor, "3 R"]:
-    """Compute the linear color of each hit of a surface, `Material.row`; its gloss is ignored.
-
-    The position and the width of the pixel on the surface are in meters.
-    """
+    """Compute the linear color of each hit of a surface, `Material.row`, without its gloss."""
     base, accent, cell, (shift, joint, variation, checker), grain, _ = rows.split(
         (3, 3, 2, 4, 2, 2)
     )

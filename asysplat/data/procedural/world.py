@@ -70,10 +70,7 @@ class World:
     def trace(
         self, origins: Origins, directions: Points, pixel: float
     ) -> tuple[Points, PerRay, Surface]:
-        """Return linear color, t and surface of the nearest hit of rays origin + t * direction.
-
-        `pixel` is the width of a pixel at t = 1, in meters.
-        """
+        """Return linear color, t and surface of the nearest hits; `pixel` is its width at t = 1."""
         cone = Cone.around(origins, directions)
         boxes, spheres = self._boxes.within(cone), self._spheres.within(cone)
         t, surface = self._nearest(origins, directions, boxes, spheres, REFINE_STEPS)
@@ -118,10 +115,7 @@ class World:
         return color
 
     def surfaces(self, origins: Origins, directions: Points, candidates: Index) -> Surface:
-        """Return which of the `candidates` each ray hits first, numbered as in `trace`.
-
-        It hardly depends on the exact intersection with the ground.
-        """
+        """Return which of the `candidates` each ray hits first, numbered as in `trace`."""
         tested = torch.zeros(self._surfaces.shape[1] + 1, dtype=torch.bool, device=self._sky.device)
         tested[candidates] = True  # the last is the sky
         tested[0] = tested[self._first_sphere] = True  # at least one box and one sphere
@@ -181,7 +175,6 @@ class World:
         return MIN_AMBIENT + (1 - MIN_AMBIENT) * (gap / OCCLUSION_DISTANCE).clamp(0, 1)
 
     def _sky_color(self, points: Points) -> Points:
-        """Blend from a pale horizon to a blue zenith, with clouds."""
         elevation = (points[2] / SKY_RADIUS).clamp(0, 1)
         horizon, zenith = self._sky
         clear = horizon + (zenith - horizon) * elevation.sqrt()

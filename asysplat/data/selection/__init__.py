@@ -186,10 +186,7 @@ def _check_length(num_images: int, num_inputs: int, num_targets: int) -> None:
 def kmeans_selection(
     cameras: Cameras, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
-    """Select as the paper's tests do: inputs by k-means on positions and viewing directions.
-
-    Every 8th image is a target; of the others, those nearest to the centers are inputs.
-    """
+    """Select as the paper's tests do: inputs by k-means on positions and viewing directions."""
     images, targets = paper_split(cameras.num_views, num_targets, split)
     check_held_out(cameras.num_views, len(images), num_inputs, split)
     chosen = nearest_to_centers(pose_features(cameras.select(images)), num_inputs)

@@ -116,7 +116,6 @@ def _pack(places: Float[ndarray, "N k"], bits: Sequence[int]) -> UInt32[ndarray,
 
 
 def _unpack(packed: UInt32[ndarray, "N"], bits: Sequence[int]) -> Float[ndarray, "N k"]:
-    """Unpack numbers in [0, 1] from 32 bits."""
     columns, shift = [], 32
     for count in bits:
         shift -= count

@@ -95,7 +95,6 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def _sh_names(count: int) -> list[str]:
-    """Return the names of the first `count` SH coefficients, by degree and order."""
     places = [(math.isqrt(index), index - math.isqrt(index) ** 2) for index in range(count)]
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}" for degree, order in places]
 
@@ -201,7 +200,6 @@ def _move(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 
 
 def _read_accessor(root: dict[str, Any], buffer: bytes, index: int) -> Float[ndarray, "N size"]:
-    """Read the numbers of an attribute."""
     accessor = root["accessors"][index]
     view = root["bufferViews"][accessor["bufferView"]]
     if accessor.get("sparse") or view.get("extensions") or view["buffer"]:

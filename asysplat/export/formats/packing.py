@@ -20,10 +20,7 @@ GENERIC_DIRECTION = (0.36, 0.48, 0.8)  # no SH function up to degree 3 is 0 alon
 
 
 def morton_order(means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
-    """Compute an order along a Z-order curve, in which bytes compress to less.
-
-    Neighbors in space become neighbors in the file.
-    """
+    """Compute an order in space along a Z-order curve, in which bytes compress to less."""
     low = means.double().amin(0)
     extent = (means.double().amax(0) - low).amax().clamp_min(1e-300)
     cells = ((means.double() - low) / extent * (2**MORTON_BITS - 1)).long()

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from numpy import ndarray
 from PIL import Image
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -52,13 +51,6 @@ def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
     fitted to the scene, the other SH the nearest of a palette. Gaussians are ordered along a
     Z-order curve. meta.json tells whether they are to be rendered `antialiased`.
     """
-    content = encode_sog(gaussians, antialiased)
-    with atomic_write(path) as partial:
-        partial.write_bytes(content)
-
-
-def encode_sog(gaussians: Gaussians, antialiased: bool = False) -> bytes:
-    """Return the content of a SOG bundle, or raise InputError; see `write_sog`."""
     scene = in_morton_order(prepare_for_export(gaussians))
     count = len(scene.opacities)
     if count > MAX_SIDE**2:
@@ -80,7 +72,8 @@ def encode_sog(gaussians: Gaussians, antialiased: bool = False) -> bytes:
     with zipfile.ZipFile(bundle, "w") as archive:
         for name, content in files.items():
             archive.writestr(zipfile.ZipInfo(name), content)  # its date is always 1980
-    return bundle.getvalue()
+    with atomic_write(path) as partial:
+        partial.write_bytes(bundle.getvalue())
 
 
 def _quantize(scene: Gaussians) -> tuple[dict[str, dict], dict[str, Int[Tensor, "N channels"]]]:
@@ -140,10 +133,7 @@ def _webp(pixels: Int[Tensor, "N channels"], width: int) -> bytes:
 
 
 def _codebook(values: Float[Tensor, "*shape"]) -> tuple[list[float], Int[Tensor, "*shape"]]:
-    """Fit 256 numbers, ascending, and compute the index of the nearest one of each value.
-
-    Lloyd's iterations of k-means, whose clusters in one dimension are intervals of sorted values.
-    """
+    """Fit 256 numbers, ascending, by k-means; return them and the index of each value's nearest."""
     ordered = values.double().flatten().sort().values
     codes = ordered.unique()
     if len(codes) > CODES:
@@ -220,6 +210,8 @@ def read_sog(path: str | Path) -> Gaussians:
             for name in ("means", "quats", "scales", "sh0")
             for image in _images(archive, meta[name])
         )
+        rotations = rotations.numpy()
+        largest = rotations[:, 3].astype(np.int64) - FIRST_TAG
         fixed = coarse[:, :3].int() << 8 | fine[:, :3]
         logs = low + (high - low) * fixed / 65535
         sh = [_decode(meta["sh0"], colors[:, None, :3])]
@@ -227,7 +219,7 @@ def read_sog(path: str | Path) -> Gaussians:
             sh.append(_read_palette(archive, meta["shN"], count))
         return Gaussians(
             means=(logs.sign() * logs.abs().expm1()).float(),
-            quats=_quats(rotations.numpy()),
+            quats=join_largest(largest, (rotations[:, :3] / 127.5 - 1) / math.sqrt(2)).float(),
             scales=_decode(meta["scales"], scales[:, :3]).exp().clamp_min(TINY),
             opacities=(colors[:, 3] / 255).clamp_min(TINY),
             sh=torch.cat(sh, 1),
@@ -248,7 +240,6 @@ def _read_meta(archive: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _images(archive: zipfile.ZipFile, record: dict) -> list[UInt8[Tensor, "height width 4"]]:
-    """Read a record's images, in RGBA."""
     files = (BytesIO(archive.read(name)) for name in record["files"])
     images = (Image.open(file, formats=("WEBP",)).convert("RGBA") for file in files)
     return [torch.from_numpy(np.array(image)) for image in images]
@@ -256,11 +247,6 @@ def _images(archive: zipfile.ZipFile, record: dict) -> list[UInt8[Tensor, "heigh
 
 def _decode(record: dict, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.tensor(record["codebook"], dtype=torch.float32)[codes.int()]
-
-
-def _quats(rotations: UInt8[ndarray, "N 4"]) -> Float[Tensor, "N 4"]:
-    largest = rotations[:, 3].astype(np.int64) - FIRST_TAG
-    return join_largest(largest, (rotations[:, :3] / 127.5 - 1) / math.sqrt(2)).float()
 
 
 def _read_palette(archive: zipfile.ZipFile, record: dict, count: int) -> Float[Tensor, "N terms 3"]:

@@ -56,13 +56,8 @@ class Checkpoints(ModelCheckpoint):
     checkpoint the signal's earlier handler runs (submitit's, for example), or the run ends with
     status 128 + the signal's number.
 
-    A checkpoint holds, in addition to Lightning's entries, `revision` and `random_states` (a list,
-    one of each process).
-
-    Args:
-        dirpath: the folder.
-        minutes: minutes of training after which last.ckpt is written between validations; 0: after
-            every step; None: only after validations.
+    Beside Lightning's entries, a checkpoint holds `revision` and each process's `random_states`.
+    `minutes` of 0 stand for every step; without them last.ckpt is only written after validations.
     """
 
     def __init__(self, dirpath: str | Path, minutes: int | float | None = None, **options: Any):
@@ -115,8 +110,7 @@ class Checkpoints(ModelCheckpoint):
             return
         waited = time.monotonic() - self.saved_at
         elapsed = self.minutes is not None and waited >= 60 * self.minutes
-        if elapsed or self.preempted_by is not None:
-            self.save_due = True
+        self.save_due |= elapsed or self.preempted_by is not None
         if trainer.strategy.reduce_boolean_decision(self.save_due, all=False):
             self._save_last(trainer)
         self._forward_preemption(trainer)
@@ -153,11 +147,9 @@ class Checkpoints(ModelCheckpoint):
         if trainer.is_global_zero:
             name = signal.Signals(number).name
             print(f"{name}: saved at step {trainer.global_step}", flush=True)
-        handler = self.handlers[number]
-        if callable(handler):
-            handler(number, None)
-        else:
+        if not callable(self.handlers[number]):
             raise SystemExit(128 + number)
+        self.handlers[number](number, None)
 
     def on_exception(self, trainer: Trainer, module: LightningModule, error: BaseException) -> None:
         if not trainer.is_global_zero:
@@ -196,11 +188,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class StageRecord(Callback):
-    """Saves the name of the stage and the results of the stages before it in each checkpoint.
-
-    A later stage writes its first checkpoint before its first step, which saves the results of the
-    stage before it.
-    """
+    """Saves the name of the stage and the results of the stages before it in each checkpoint."""
 
     def __init__(self, stage: str, earlier: Results):
         self.stage, self.earlier = stage, earlier

@@ -17,12 +17,9 @@ from asysplat.training.module import SplattingModule
 class Costs(Callback):
     """Collects the costs of a run in `values`, "cost/..." -> number.
 
-    Before the first step, it counts the `static_costs` of one scene at the run's views and
-    resolution, prints the training's plan (`make_plan`) and refuses a training that does not fit.
-    During the run it measures, by `CostMeter`, seconds and peak memory of a training step
-    (seconds_per_step, the mean; peak_gb) and of the network's forward pass over the test scenes
-    (inference_seconds, the mean of all but the longest; inference_gb; under cost/<set>/ for further
-    test sets).
+    The `static_costs` of one scene at the run's views and resolution; seconds_per_step, the mean,
+    and peak_gb of training; and inference_seconds, the mean of all but the longest, and
+    inference_gb of the network's forward pass over test scenes, of further sets under cost/<set>/.
     """
 
     def __init__(self):
@@ -92,10 +89,7 @@ class Costs(Callback):
 
 
 def make_plan(trainer: Trainer, module: SplattingModule) -> str:
-    """Try a micro-batch and describe the training: parameters, steps, memory in 1e9 bytes, time.
-
-    The network is left as it was. The memory is without the optimizer's moments.
-    """
+    """Try a micro-batch, refuse what does not fit, and describe the training."""
     capacity = memory_gb(module.device)
     capacity /= 1 if module.device.type == "cuda" else trainer.num_devices
     try:

@@ -13,11 +13,7 @@ from asysplat.training.parallel import Batch, Prediction
 
 
 class Figures(Callback):
-    """Draws a `comparison_figure` of the first scenes of each validation and first test set.
-
-    Args:
-        scenes: how many scenes to draw.
-    """
+    """Draws a `comparison_figure` of the first scenes of each validation and first test set."""
 
     def __init__(self, folder: str, scenes: int):
         self.folder, self.scenes = Path(folder) / "figures", scenes

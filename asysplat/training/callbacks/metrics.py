@@ -17,13 +17,10 @@ IMAGE = ("set", "scene", "view")  # the columns that identify a row
 
 
 class Metrics(Callback):
-    """Computes PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for loggers and a CSV.
+    """Computes the protocol's metrics of each image, for loggers and a CSV.
 
     `results` holds the means of every test set, the protocol's descriptions, and the fractions that
     the network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
-
-    Args:
-        backbone_dir: folder of LPIPS' backbone; without the backbone there is no LPIPS.
     """
 
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
@@ -31,8 +28,8 @@ class Metrics(Callback):
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.rows: list[ImageRow] = []
         self.early_exit_rows: list[ImageRow] = []
-        descriptions = protocol.describe()
-        self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in descriptions.items()}
+        described = protocol.describe().items()
+        self.results: dict[str, float | str] = {f"protocol/{k}": text for k, text in described}
 
     def setup(self, trainer: Trainer, module: SplattingModule, stage: str) -> None:
         if hasattr(self, "lpips"):
@@ -48,8 +45,7 @@ class Metrics(Callback):
             inputs, targets, drawn = (part.map(itemgetter(index)) for part in parts)
             rows = self.protocol.measure_views(drawn.image, drawn.depth, targets, lpips)
             # The learning curve has no other metric of the baselines.
-            options = {"lpips": lpips, "psnr_only": validation}
-            baselines = self.protocol.measure_baselines(inputs, targets, **options)
+            baselines = self.protocol.measure_baselines(inputs, targets, lpips, validation)
             for view, row in enumerate(rows):
                 for name, numbers in baselines.items():
                     row |= {f"{name}/{metric}": value for metric, value in numbers[view].items()}
@@ -62,12 +58,7 @@ class Metrics(Callback):
         self.rows, self.early_exit_rows = [], []
 
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        module: SplattingModule,
-        outputs: Prediction,
-        batch: Batch,
-        *_: object,
+        self, trainer: Trainer, _: SplattingModule, outputs: Prediction, batch: Batch, *__: object
     ) -> None:
         self._add(trainer.datamodule.name, batch, outputs, validation=True)
 

@@ -20,13 +20,11 @@ SAMPLES = 10_000  # values of a validation scene in a histogram, at least, if it
 class TrainingMonitor(Callback):
     """Logs the costs of every `every` steps and statistics of each validation's Gaussians.
 
-    - time/: views_per_second and seconds_per_step, without validations; torch.profiler says where
-      they go.
+    - time/: views_per_second and seconds_per_step, without validations.
     - memory/: peak_gb, see `peak_memory_gb`.
     - gradient/: the norm of each part of the network, before it is clipped.
     - gaussians/: histograms and medians, over the scenes of the first process, of opacities, of
-      scales (the geometric mean of a Gaussian's three) and of depths as rendered at the targets, in
-      units of the farthest input.
+      scales (the geometric mean of a Gaussian's three) and of rendered depths at the targets.
     """
 
     def __init__(self, every: int = 50):

@@ -12,11 +12,7 @@ from asysplat.training.parallel import Batch
 
 
 class NonFiniteSteps(Callback):
-    """Drops a step with a NaN or infinite gradient, and restores the buffers that it changed.
-
-    Args:
-        budget: the run ends after this many non-finite steps in a row.
-    """
+    """Drops steps with a NaN or infinite gradient, with their changes, up to `budget` in a row."""
 
     def __init__(self, budget: int = 10):
         self.budget = budget
@@ -70,10 +66,7 @@ class NonFiniteSteps(Callback):
 
 
 class BadScenes(Callback):
-    """Counts the training scenes that could not be read and were replaced by others.
-
-    The end of the training names them; data.on_error=skip goes on without them.
-    """
+    """Counts and names the training scenes that data.on_error=skip has replaced by others."""
 
     def __init__(self):
         self.count = 0

@@ -32,8 +32,7 @@ NO_DEPTHS = (
 class RenderedDisparity:
     """The paper's formula: compares the depth rendered at the targets with their disparities.
 
-    Args:
-        stride: both maps are downsampled by it; None: by p_c / p_f of the model, as in the paper.
+    Both maps are downsampled by `stride`; None: by p_c / p_f of the model, as in the paper.
     """
 
     renders_depth = True
@@ -141,10 +140,7 @@ def disparity_distance(
     target: Float[Tensor, "*batch V H W"],
     valid: Bool[Tensor, "*batch V H W"],
 ) -> Float[Tensor, ""]:
-    """Compute the mean over scenes of the mean SmoothL1 between normalized disparities.
-
-    The inner mean is over a scene's valid pixels, which have a predicted depth and a target.
-    """
+    """Compute the mean over scenes of the mean SmoothL1 of normalized disparities, where valid."""
     predicted, expected = (
         normalized_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
         for maps in (1 / torch.where(valid, depth, 1), target)
@@ -158,8 +154,8 @@ def normalized_disparity(
 ) -> Float[Tensor, "V H W"]:
     """Compute (disparity - median) / mean absolute deviation of each view; invalid pixels are 0.
 
-    The deviation is at least MIN_DEVIATION of the median: the depths of an untrained network are
-    nearly the same, and a division by almost nothing would make their gradients the largest of all.
+    The deviation is at least MIN_DEVIATION of the median: depths of an untrained network are nearly
+    the same, and a division by almost nothing would make their gradients the largest of all.
     """
     values = torch.where(valid, disparity, torch.nan).flatten(1)
     median = values.nanmedian(dim=1, keepdim=True).values

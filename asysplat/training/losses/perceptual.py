@@ -14,13 +14,7 @@ from asysplat.kernels.dispatch import without_autocast
 
 
 class PerceptualDistance(nn.Module):
-    """Weighted sum of the mean absolute differences of activations; fp32 also under autocast.
-
-    Args:
-        features: frozen; images [B, 3, H, W] in [0, 1] -> activations.
-        weights: one for each activation.
-        image_weight: weight of the mean absolute difference of the images themselves.
-    """
+    """Weighted sum, in fp32, of the mean absolute differences of frozen activations and images."""
 
     def __init__(self, features: VGGFeatures, weights: Sequence[float], image_weight: float):
         super().__init__()
@@ -48,10 +42,7 @@ class PerceptualDistance(nn.Module):
 
 
 def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance:
-    """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
-
-    Images are normalized with ImageNet's mean and standard deviation.
-    """
+    """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016)."""
     backbone = _backbone("vgg16", backbone_dir, download)
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
     return PerceptualDistance(features, weights=[1 / 5] * 5, image_weight=0.0)
@@ -70,12 +61,7 @@ def longlrm(
 
     The weighted sum of Chen and Koltun 2017 over the images and VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and
     5_2, with mean pooling in place of maximum pooling. Images, less ImageNet's mean, are scaled to
-    [0, 255], and distances divided by 255.
-
-    Args:
-        backbone_dir, download: as for `vgg16`.
-        weights: those of MatConvNet, which Long-LRM names and publishes in these units, or
-            torchvision's.
+    [0, 255], and distances divided by 255. Long-LRM publishes MatConvNet's weights in these units.
     """
     name = "matconvnet_vgg19" if weights == "matconvnet" else "vgg19"
     backbone = _backbone(name, backbone_dir, download)

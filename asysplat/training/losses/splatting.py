@@ -21,9 +21,7 @@ class SplattingLoss(nn.Module):
 
     Args:
         mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off.
-        perceptual_term, depth_term: constructors, called if the term's weight is not 0.
-        allow_missing: turn off, with a warning, the depth term if the data has no depths or
-            disparities for it.
+        allow_missing: turn off the depth term, with a warning, if the data has nothing for it.
     """
 
     def __init__(
@@ -39,8 +37,7 @@ class SplattingLoss(nn.Module):
     ):
         super().__init__()
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
-        self.ssim, self.opacity = ssim, opacity
-        self.allow_missing = allow_missing
+        self.ssim, self.opacity, self.allow_missing = ssim, opacity, allow_missing
         # A list hides the frozen network from checkpoints.
         self._perceptual_term = [perceptual_term()] if perceptual else []
         self._depth_term = depth_term() if depth else None
@@ -52,12 +49,8 @@ class SplattingLoss(nn.Module):
         self._depth_checked, self._depth_missing = False, False
 
     def describe(self) -> str:
-        """Name the terms that ran, with their weights; the perceptual one with its network's hash.
-
-        As `1 mse, 0.5 perceptual (1a2b3c4d5e6f7a8b), 0.01 depth`.
-        """
-        names = ["mse", "ssim", "opacity", "perceptual", "depth"]
-        on = {name: getattr(self, name) for name in names}
+        """Name the terms that ran: `1 mse, 0.5 perceptual (hash of its network), 0.01 depth`."""
+        on = {name: getattr(self, name) for name in ("mse", "ssim", "opacity", "perceptual")}
         on["depth"] = 0 if self._depth_missing else self.depth
         terms = {name: f"{weight:g} {name}" for name, weight in on.items() if weight}
         for distance in self._perceptual_term:
@@ -71,8 +64,8 @@ class SplattingLoss(nn.Module):
 
     def forward(self, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """Compute the weighted sum, as "loss", and each term that is on, unweighted."""
-        targets = batch["targets"]
-        terms, image = {}, targets.masked(prediction.rendering.image)
+        terms, targets = {}, batch["targets"]
+        image = targets.masked(prediction.rendering.image)
         if self.mse:
             terms["mse"] = F.mse_loss(image, targets.images)
         if self.ssim:
