@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from saved_tensors import saved_bytes
 from torch import nn
 
 from asysplat.evaluation.static_cost import (
@@ -35,18 +36,8 @@ def test_static_costs_at_the_papers_scale_are_the_papers(build):
 def test_activation_memory_is_what_a_forward_pass_saves(build):
     net = build("model=asysplat_4m4s", "width=0.125", "state_size=8")
     views = blank_views(2, 64, 64).map(torch.zeros_like)
-    parameters = {p.untyped_storage().data_ptr() for p in [*net.parameters(), *net.buffers()]}
-    saved = {}
-
-    def save(tensor):
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() not in parameters:
-            saved[storage.data_ptr()] = storage
-        return tensor
-
-    with torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor):
-        net(views)
-    assert activation_gb(net, 2, 64, 64) == sum(s.nbytes() for s in saved.values()) / 1e9
+    _, saved = saved_bytes(net, lambda: net(views))
+    assert activation_gb(net, 2, 64, 64) == saved / 1e9
 
 
 def test_parameters_include_frozen_ones_and_no_buffers():

@@ -5,6 +5,7 @@ import gc
 
 import pytest
 import torch
+from saved_tensors import saved_bytes
 from test_parallel_scenes import make_batch, module  # noqa: F401
 
 from asysplat.evaluation.measured_cost import peak_memory_gb, reset_peak_memory
@@ -14,20 +15,12 @@ from asysplat.training import SplattingLoss
 
 def step(module):  # noqa: F811
     """The gradients of a step that renders two views of three scenes, and what autograd keeps."""
-    batch, kept = make_batch(), {}
+    batch = make_batch()
     batch["targets"] = batch["inputs"]
-
-    def keep(tensor):
-        storage = tensor.untyped_storage()
-        kept[storage.data_ptr()] = storage
-        return tensor
-
     module.zero_grad()
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        loss = module.scene_terms(batch, module.net)["loss"]
-    loss.backward()
-    grads = torch.cat([p.grad.flatten() for p in module.parameters() if p.requires_grad])
-    return grads, sum(storage.nbytes() for storage in kept.values())
+    terms, kept = saved_bytes(module, lambda: module.scene_terms(batch, module.net))
+    terms["loss"].backward()
+    return torch.cat([p.grad.flatten() for p in module.parameters() if p.requires_grad]), kept
 
 
 def test_the_same_gradients_in_less_memory(module):  # noqa: F811
