@@ -60,11 +60,6 @@ def test_parameters_and_head_at_full_width(build, model):
     assert type(net.head) is LongLRMHead  # one for all; at laptop scale tests/conf trains ours
 
 
-def test_geometry_ratio_of_the_paper(build):
-    net = build("model=asysplat_4m4s", "scale=paper", device="meta")
-    assert abs(net.geometry_ratio() - 0.905) < 0.001
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(("width", "ratio"), [(0.125, 0.95), (0.25, 0.7), (1.0, 0.3)])
 def test_a_geometry_ratio_is_met_at_the_same_total(build, ratio, width):
@@ -113,7 +108,6 @@ def test_networks_that_differ_in_a_component_start_alike_in_the_others(build, ov
     [
         (["parameter_budget=0.5"], "without a geometry_ratio"),
         (["model=longlrm", "geometry_ratio=0.5"], "leave them out"),
-        (["model=longlrm", "model.merges=[true]"], "model.merges has 1 entries for 3 stages"),
         (["model=single_branch", "model.global_tokens=2"], "model.global_tokens=2 with sparse"),
     ],
 )
@@ -233,7 +227,7 @@ def test_a_layer_mix_names_each_layer_by_its_letter(mix, layers):
     assert "".join(parse_layer_mix(mix, {"m", "s", "t"})) == layers
 
 
-@pytest.mark.parametrize("mix", ["", "4x4s", "m4", "0m", "4m-4s"])
+@pytest.mark.parametrize("mix", ["", "4x4s"])
 def test_bad_layer_mix(mix):
     with pytest.raises(InputError, match="such as 4m4s"):
         parse_layer_mix(mix, {"m", "s", "t"})

@@ -5,12 +5,10 @@ from itertools import product
 
 import pytest
 import torch
-from hydra.errors import InstantiationException
 from scipy.spatial.transform import Rotation
 from test_asysplat import make_views
 
-from asysplat.errors import InputError, input_error_behind
-from asysplat.models import MVSplat
+from asysplat.errors import InputError
 from asysplat.models.mvsplat import (
     MAX_SH_DEGREE,
     WINDOWS,
@@ -123,15 +121,3 @@ def test_a_number_of_views_that_it_does_not_take(net, views, fit):
     message = f"2 to 8 input views and got {views}: set data.inputs={fit}"
     with pytest.raises(InputError, match=message):
         net(make_views(batch=(1,), views=views))
-
-
-def test_it_has_no_branches_to_divide(build):
-    with pytest.raises(InstantiationException) as caught:
-        build("model=mvsplat", "geometry_ratio=0.5", device="meta")
-    assert "leave them out" in str(input_error_behind(caught.value))
-
-
-def test_its_size_scales(build):
-    small, large = (build("model=mvsplat", f"width={w}", device="meta") for w in (0.25, 1.0))
-    assert isinstance(small, MVSplat)
-    assert large.describe() == "11.88M parameters" and small.describe() == "1.47M parameters"

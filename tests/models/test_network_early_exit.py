@@ -1,13 +1,12 @@
 """Early exit: exact when off, skips what its thresholds name, and reports the fractions."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from pydantic import ValidationError
 from test_prior import wall
 from tiny import NETWORK
 
@@ -118,13 +117,6 @@ def test_presets_skip_where_the_prior_is_confident(net, composed):
     assert skipped["balanced", "flat"] == skipped["fast", "flat"] == 0
     assert skipped["balanced", "textured"] > 0.3
     assert skipped["fast", "textured"] == 1
-
-
-@pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")], ids=str)
-@pytest.mark.parametrize("name", [field.name for field in fields(EarlyExit)])
-def test_bad_thresholds_are_refused(name, value):
-    with pytest.raises(ValidationError, match=rf"speed\n{name}"):
-        EarlyExit(**{name: value})
 
 
 def test_a_bad_override_is_one_sentence(composed):

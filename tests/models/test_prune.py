@@ -45,10 +45,9 @@ def test_nothing_to_prune_changes_nothing():
     assert Prune(0.99)(scene).num_gaussians == 1
 
 
-@pytest.mark.parametrize("ratios", [(1.0, 0.0), (-0.1, 0.0), (0.5, 1.5)])
-def test_ratios_out_of_range_are_refused(ratios):
+def test_ratios_out_of_range_are_refused():
     with pytest.raises(ValidationError, match=r"model\.prune"):
-        Prune(*ratios)
+        Prune(1.0, 0.0)
 
 
 def test_long_lrm_prunes_in_its_last_stage_alone(build):

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from test_asysplat import make_views
 from tiny import SIZE as TINY
 
-from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.stage import TokenMerge
 
 
@@ -29,9 +29,7 @@ def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
     shapes = []
     for block in (layer for stage in net.stages for layer in stage.layers):
         block.register_forward_pre_hook(lambda _, inputs: shapes.append(inputs[0].shape))
-    views = blank_views(3, 32, 48).map(lambda tensor: torch.rand(tensor.shape))
-    views.cameras.intrinsics[:] = torch.tensor([[50.0, 0, 24], [0, 50, 16], [0, 0, 1]])
-    views.cameras.cam_to_world[:] = torch.eye(4)
+    views = make_views(batch=(1,), views=3, height=32, width=48)
     gaussians = net(views)
     assert shapes[0][1:4] == (1, 1, 2 + 3 * 4 * 6) and shapes[-1][1:4] == (1, 1, 2 + 3 * 2 * 3)
     sum(field.sum() for field in (gaussians.means, gaussians.sh, gaussians.opacities)).backward()
@@ -46,13 +44,11 @@ def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
 def test_a_gaussian_for_every_pixel(build, model, patch):
     net = build(*TINY, f"model={model}")
     assert net.patch == patch
-    views = blank_views(2, 32, 64).map(torch.zeros_like)
-    views.cameras.intrinsics[..., :, :] = torch.tensor([[50.0, 0, 32], [0, 50, 16], [0, 0, 1]])
-    views.cameras.cam_to_world[..., :, :] = torch.eye(4)
+    views = make_views(batch=(1,), views=2, height=32, width=64)
     gaussians = net(views).validate()
     assert gaussians.num_gaussians == 2 * 32 * 64
     # One stands on the ray through each pixel's center.
-    first = gaussians.means[0, 0]
+    first = gaussians.means[0, 0] - views.cameras.centers[0, 0]
     torch.testing.assert_close(
         first[:2] / first[2], torch.tensor([(0.5 - 32) / 50, (0.5 - 16) / 50])
     )
@@ -61,9 +57,7 @@ def test_a_gaussian_for_every_pixel(build, model, patch):
 @pytest.mark.medium
 def test_every_view_reaches_every_other(build):
     net = build(*TINY, "model=longlrm").eval()
-    views = blank_views(2, 32, 32).map(torch.zeros_like)
-    views.cameras.intrinsics[..., :, :] = torch.tensor([[50.0, 0, 16], [0, 50, 16], [0, 0, 1]])
-    views.cameras.cam_to_world[..., :, :] = torch.eye(4)
+    views = make_views(batch=(1,), views=2, height=32, width=32)
     before = net(views).opacities[0, : 32 * 32]
     views.images[:, 1] = torch.rand(3, 32, 32)
     assert (net(views).opacities[0, : 32 * 32] - before).abs().max() > 0

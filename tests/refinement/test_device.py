@@ -5,25 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 from pretend_device import DEVICE, pretended_device
+from test_refine import small_scene, small_views
 
 from asysplat.errors import InputError
 from asysplat.refinement import DEFAULT, StepSchedule, refine
-from asysplat.refinement.isotropic import isotropic_gaussians
-from asysplat.scene import Cameras, Views
 
 
 @pytest.fixture
 def scene():
     """Gaussians, and photographs of noise with masks."""
-    poses = torch.eye(4).repeat(3, 1, 1)
-    poses[:, 0, 3] = torch.linspace(-1, 1, 3)
-    matrix = torch.tensor([[15.0, 0, 7.5], [0, 15, 6], [0, 0, 1]])
-    images = torch.rand(3, 3, 12, 15)
-    masks = torch.rand(3, 12, 15) > 0.1
-    views = Views(Cameras(matrix.repeat(3, 1, 1), poses, 12, 15), images, masks=masks)
-    means = torch.rand(60, 3) + torch.tensor([-0.5, -0.5, 2])
-    sizes, opacities = torch.full((60,), 0.1), torch.linspace(0.001, 0.9, 60)
-    return isotropic_gaussians(means, sizes, opacities, torch.rand(60, 3)), views
+    gaussians = small_scene(60)
+    gaussians.opacities[:] = torch.linspace(0.001, 0.9, 60)
+    return gaussians, replace(small_views(3), masks=torch.rand(3, 12, 15) > 0.1)
 
 
 def watched(gaussians, views, settings):

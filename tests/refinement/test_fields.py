@@ -87,18 +87,14 @@ def test_invisible_rows_and_fields_without_a_rate_stay(gaussians):
     for gradient in gradients.values():
         gradient[::3] = 0
     gradients["sh"][1] = torch.nan
-    rates = replace(DEFAULT.rates, quats=0.0, opacities=0.0)
+    rates = replace(DEFAULT.rates, quats=0.0)
     seen = fields.step(gradients, rates, 1.0)
     assert torch.equal(seen, torch.arange(12) % 3 > 0)
     assert fields.optimizer.non_finite == 1
     found = fields.gaussians()
-    for name in NAMES:
-        same = (getattr(found, name) == getattr(gaussians, name)).flatten(1 - (name == "opacities"))
-        stays = same.view(12, -1).all(-1)
-        if name in ("quats", "opacities"):
-            torch.testing.assert_close(getattr(found, name), getattr(gaussians, name))
-        elif name == "means":
-            assert torch.equal(~stays, seen & (torch.arange(12) != 1))
+    torch.testing.assert_close(found.quats, gaussians.quats)
+    moved = (found.means != gaussians.means).any(-1)
+    assert torch.equal(moved, seen & (torch.arange(12) != 1))
 
 
 def test_leaves_have_gradients_and_parameters_none(gaussians):

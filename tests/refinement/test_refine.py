@@ -9,6 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 from pydantic import ValidationError
+from test_init import front_views
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.metrics import psnr
@@ -26,7 +27,7 @@ from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import correct_poses
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Gaussians, Views
 
 NAMES = [field.name for field in fields_of(Gaussians)]
 KINDS = ["error", "mcmc", "gradient", "none"]
@@ -50,12 +51,10 @@ def watched(start, views, settings, record=lambda progress, _: progress, **limit
 
 
 def small_views(count=2, height=12, width=15):
-    """Photographs of noise, from cameras that look along z."""
-    poses = torch.eye(4).repeat(count, 1, 1)
-    poses[:, 0, 3] = torch.linspace(-1, 1, count) if count > 1 else 0
-    matrix = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
-    cameras = Cameras(matrix.repeat(count, 1, 1), poses, height, width)
-    return Views(cameras, torch.rand(count, 3, height, width))
+    places = torch.zeros(count, 3)
+    if count > 1:
+        places[:, 0] = torch.linspace(-1, 1, count)
+    return front_views(places, height, width, focal=width)
 
 
 def small_scene(count=20):
@@ -84,12 +83,12 @@ def test_input_and_held_out_views_improve(room, start, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(room, start, kind, threads):
     found = []
-    for count, seed in ((1, 0), (2, 0), (2, 0), (1, 1)):
+    for count, seed in ((1, 0), (2, 0), (1, 1)):
         threads(count)
         settings = replace(DEFAULT, densify=kind, densify_rounds=3)
         found.append(refine(start, room[0], settings, steps=12, seed=seed))
-    assert same_bits(found[1], found[0]) and same_bits(found[2], found[0])
-    assert not torch.equal(found[3].sh, found[0].sh)
+    assert same_bits(found[1], found[0])
+    assert not torch.equal(found[2].sh, found[0].sh)
 
 
 @pytest.mark.medium
@@ -120,10 +119,8 @@ def test_masked_pixels_have_no_effect_on_a_refinement():
     masks[0, :7] = False
     masks[1, :, 3:6] = False
     noise = torch.where(masks[:, None], views.images, torch.rand_like(views.images))
-    settings, start = (
-        replace(DEFAULT, ssim=0.0, half_resolution_until=0.5, densify_rounds=2),
-        small_scene(),
-    )
+    settings = replace(DEFAULT, ssim=0.0, half_resolution_until=0.5, densify_rounds=2)
+    start = small_scene()
     one, other = (
         refine(start, Views(views.cameras, images, masks=masks), settings, steps=10)
         for images in (views.images, noise)
@@ -226,17 +223,6 @@ def test_densification_grows_evenly_to_its_limit(kind, limit, most):
         assert all(b <= even * a + 1 for a, b in pairwise(counts))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_refinement_that_grows_starts_with_few_gaussians(kind):
-    settings = replace(DEFAULT, densify=kind, initial_fraction=0.25, max_gaussians=50_000)
-    if kind in ("error", "mcmc"):
-        assert settings.initial_limit == 12_500
-        assert replace(settings, max_gaussians=1).initial_limit == 1
-    else:
-        assert settings.initial_limit == 50_000
-    assert replace(settings, max_gaussians=None).initial_limit > 10**9
-
-
 def test_pruned_gaussians_are_replaced():
     """In a long refinement more would be lost between two rounds than one adds."""
     start = small_scene()
@@ -310,11 +296,6 @@ def test_3dgs_densifies_resets_opacities_and_adds_sh_degrees_at_its_steps():
     assert highest == [0] * 8 + [1] * 8 + [2] * 8 + [3] * 24
 
 
-def test_3dgs_has_no_limit():
-    start, views = small_scene(), small_views()
-    assert Refinement(start, views, settings=PUBLISHED_3DGS)._max_gaussians > 10**9
-
-
 def test_watch_may_end_a_refinement():
     settings, records = replace(DEFAULT, densify="none"), []
     stop = lambda record, _: records.append(record) or record.step == 3  # noqa: E731
@@ -343,20 +324,6 @@ def test_seconds_end_a_refinement():
     assert all(progress.fraction < 1 for progress in records[:-1]) and records[-1].fraction == 1
     assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(records))
     assert records[-1].seconds >= 0.3
-
-
-def test_resized_images_have_the_same_means_and_field_of_view():
-    views = small_views(2, 9, 14)
-    masks = torch.ones(2, 9, 14, dtype=torch.bool)
-    masks[1, 3, 5] = False
-    half = replace(views, masks=masks).resized(4, 7)
-    assert torch.equal(half.cameras.intrinsics, views.cameras.resized(4, 7).intrinsics)
-    assert half.masks.sum() == 2 * 4 * 7 - 1 and not half.masks[1, 1, 2]
-    whole = small_views(1, 8, 8)
-    blocks = whole.images.unflatten(2, (4, 2)).unflatten(4, (4, 2)).mean((3, 5))
-    half = whole.resized(4, 4)
-    torch.testing.assert_close(half.images, blocks)
-    assert half.masks is None
 
 
 def test_the_background_is_the_mean_color_of_unmasked_pixels(threads):
@@ -431,9 +398,6 @@ def test_refine_names_wrong_arguments():
     white = replace(views, images=views.images + 0.5)
     for sentence, start, given, limit in (
         ("seconds=None and steps=None: give one", small, views, {}),
-        ("seconds=1.0 and steps=1: give one", small, views, {"seconds": 1.0, "steps": 1}),
-        ("steps=0 should be greater", small, views, {"steps": 0}),
-        ("seconds=0.0 should be greater", small, views, {"seconds": 0.0}),
         ("seconds=nan should be a finite", small, views, {"seconds": math.nan}),
         ("no Gaussians", small.keep(torch.zeros(20) > 0), views, {"steps": 1}),
         (r"gaussians.means\[3\] holds NaN", bad, views, {"steps": 1}),
@@ -447,13 +411,8 @@ def test_refine_names_wrong_arguments():
     ("settings", "options", "sentence"),
     [
         (PUBLISHED_3DGS.every, {"round": 0}, "every.round=0 should be greater than or equal to 1."),
-        (DEFAULT, {"half_resolution_until": 1.5}, "half_resolution_until=1.5 should be less than"),
         (DEFAULT, {"densify": "adc"}, "densify=adc should be 'error', 'mcmc', 'gradient' or"),
-        (DEFAULT, {"sh_degree": 4}, "sh_degree=4 should be less than or equal to 3."),
-        (DEFAULT, {"max_gaussians": 0}, "max_gaussians=0 should be greater"),
-        (DEFAULT, {"ssim": -1.0}, "ssim=-1.0 should be greater"),
         (DEFAULT, {"every": PUBLISHED_3DGS.every}, "every: set densify=gradient"),
-        (DEFAULT.rates, {"unit": "meter"}, "rates.unit=meter should be 'pixel' or 'scene'."),
         (DEFAULT.rates, {"sh": math.nan}, "rates.sh=nan should be a finite number."),
         (SCAFFOLD_GS, {"max_gaussians": 9}, "max_gaussians=9 should be greater than"),
     ],
