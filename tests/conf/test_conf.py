@@ -104,15 +104,6 @@ def test_a_choice_trains_a_step_at_a_tiny_size(composed, choice):
         assert not torch.equal(before[name], parameter) and parameter.isfinite().all(), name
 
 
-def test_first_comment_is_the_command():
-    scripts = {name: f"{name}.py" for name in ("report", "benchmark", "evaluate", "reconstruct")}
-    scripts |= dict.fromkeys(("refinement", "quality"), "reconstruct.py")  # folders
-    for path in FILES:
-        comments = [line for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
-        script = scripts.get(path.stem, scripts.get(path.parent.stem, "train.py"))
-        assert any(f"python {script}" in comment for comment in comments), path
-
-
 def test_files_with_keys_of_their_own_name_self_among_the_defaults():
     for path in FILES:
         content = OmegaConf.load(path)
@@ -133,6 +124,11 @@ def test_a_stage_sets_the_sizes_of_its_scale(composed, scale):
         assert training.schedule.warmup_steps == expected.warmup_steps
         assert training.schedule.total_steps == expected.steps
     assert composed(f"scale={scale}").stage == "stage1"
+
+
+def test_speeds_name_the_same_thresholds():
+    files = [OmegaConf.load(path) for path in (CONF / "speed").glob("*.yaml")]
+    assert len(files) == 3 and len({tuple(file) for file in files}) == 1
 
 
 def test_every_table_has_its_sweep():

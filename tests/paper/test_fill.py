@@ -70,17 +70,6 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
 
 
 @pytest.mark.medium
-def test_the_head_of_every_row_is_named(compose):
-    def head(key, *overrides):
-        return fill_table(load_paper()[key], overrides, compose, {}).notes["Head"]
-
-    assert head("layers") == "ResidualHead(sh_degree=0)"
-    assert head("layers", "scale=paper") == "LongLRMHead(sh_degree=3, farthest=500.0)"
-    own = "the model's own: MVSplat"
-    assert head("two_views") == f"{own}; ResidualHead(sh_degree=0): GS-LRM †, AsySplat"
-
-
-@pytest.mark.medium
 def test_a_sweep_over_one_option_fills_its_table(compose, tmp_path):
     """python train.py -m geometry_ratio=0.5,0.9, without `sweeps=geometry_ratio`."""
     for ratio in (0.5, 0.9):
@@ -160,22 +149,6 @@ def test_runs_on_the_papers_data(compose, tmp_path):
 
 
 @pytest.mark.medium
-def test_mixed_protocols_and_folders_are_reported(compose, tmp_path):
-    for seed, root, name in ((0, "/a/DL3DV", "longlrm"), (1, "/a/DL3DV-small", "default")):
-        overrides = ["sweeps=layers", "model=asysplat_4m4s", "data=dl3dv", f"data.root={root}"]
-        numbers = {"test/dl3dv/psnr": 19.0, "protocol/name": name, "protocol/psnr": "of pixels"}
-        write_run(tmp_path / name, compose(overrides), numbers, seed)
-    filled = fill_table(load_paper()["layers"], ["data=dl3dv"], compose, finished_runs(tmp_path))
-    assert set(filled.metrics) == {
-        "protocol longlrm. PSNR: of pixels",
-        "protocol default. PSNR: of pixels",
-    }
-    assert filled.notes["Data"].endswith(
-        "are mixed, name one with data.root=... in overrides: DL3DV; DL3DV-small"
-    )
-
-
-@pytest.mark.medium
 def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     paths = ["paths.mipnerf360=/a/360_v2"]
     every = compose(["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, *paths])
@@ -207,14 +180,6 @@ def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("data", ["files", "mipnerf360", "replica", "realestate10k"])
-def test_a_table_on_any_data(compose, data):
-    filled = fill_table(load_paper()["more_views"], [f"data={data}"], compose, {})
-    assert filled.sets == {"dl3dv": data} and filled.notes["Not tested"] == ""
-    assert f"{data} data" in filled.notes["Ours"]
-
-
-@pytest.mark.medium
 def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/rooms/psnr": 20.0, "cost/inference_gb": 0.5}, 0)
@@ -229,22 +194,6 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
     sizes = [f"{stage.data.height}x{stage.data.width}" for stage in stage_configs(config)]
     assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == sizes[:2]
     assert sizes[0] != sizes[1]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "machine, memory", [("2 CPU cores", "resident set"), ("1 x NVIDIA H200", "peak allocated")]
-)
-def test_memory_is_what_the_machine_of_the_run_measures(compose, tmp_path, machine, memory):
-    config = compose(["sweeps=inference_overhead", "model=asysplat_4m4s"])
-    numbers = {"cost/inference_gb": 0.5, "run/machine": f"{machine}, torch 2.8.0"}
-    write_run(tmp_path / "run", config, numbers, 0)
-    table = load_paper()["inference_overhead"]
-    filled = fill_table(table, [], compose, finished_runs(tmp_path))
-    titles = {column.key: filled.our_title(column) for column in table.columns}
-    assert titles["inference_gb"] == f"Memory (GB), {memory}"
-    assert titles["inference_seconds"] == "Time (s)"
-    assert table.our_title(table.columns[3]) == "Memory (GB)"
 
 
 @pytest.mark.medium
@@ -294,15 +243,12 @@ def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path
     assert not ours()[3].values
 
 
-@pytest.mark.parametrize(
-    "text", ["", '{"run/config_hash": "1', "[]", '{"test/procedural/psnr": 1}']
-)
-def test_broken_results_are_ignored(compose, tmp_path, text):
+def test_broken_results_are_ignored(compose, tmp_path):
     config = compose(["sweeps=layers", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
     config.seed = 0
     assert find_run(tmp_path, config).folder == tmp_path / "run"
-    (tmp_path / "run" / "metrics.json").write_text(text)
+    (tmp_path / "run" / "metrics.json").write_text('{"test/procedural/psnr": 1}')
     with pytest.warns(UserWarning, match="is not the results of a finished run"):
         assert find_run(tmp_path, config) is None
 

@@ -24,11 +24,3 @@ def test_overrides_of_the_sweeps_reach_the_configuration(run_script, tmp_path):
     command = "python train.py sweeps=layers data=dl3dv scale=paper data.root=/a/DL3DV steps=7"
     assert f"`{command}`" in text
     assert "protocol longlrm" in text
-
-
-def test_an_unknown_table_lists_the_nearest(run_script, tmp_path):
-    result = run_script("report.py", "table=layer", f"logs={tmp_path}")
-    assert result.returncode != 0
-    assert "table=layer is unknown: did you mean layers" in result.stderr
-    assert "Traceback" not in result.stderr
-    assert not list(tmp_path.iterdir())

@@ -65,8 +65,6 @@ def test_a_measured_system_stands_beside_its_quoted_numbers(compose, write, tmp_
 
 UNLIKE = {
     "metrics": (["metrics=default"], {}, "metrics.name=default (pixelsplat)"),
-    "inputs": (["data.inputs=4"], {}, "inputs=4 (2)"),
-    "size": (["data.test_size=[128,128]"], {}, "height=128 (64)"),
     "another folder": (["data.test_root=/a/other"], {}, "root=other (test)"),
     "another index": ([], {"tested/index": "0"}, "index=0 ("),
 }
@@ -119,11 +117,3 @@ def test_further_systems_are_added_to_tables_that_quote_some(compose, write, tmp
     _, rows = fill(compose, tmp_path, "state_of_the_art")  # other options
     assert "FreeSplat" not in rows
     assert len(fill(compose, tmp_path, "layers")[0].rows) == len(load_paper()["layers"].rows)
-
-
-def test_synthetic_scenes_of_one_kind_are_named(compose, write, tmp_path):
-    rooms = ["experiment=two_views", "metrics=pixelsplat", "data.places=rooms"]
-    write("FreeSplat", 24.0, *rooms)
-    filled, rows = fill(compose, tmp_path, "two_views", "data.places=rooms")
-    assert "12 scenes of procedural data (rooms), 2 input views" in rows["FreeSplat"].note
-    assert "procedural data (rooms), 2 input views" in filled.notes["Ours"]

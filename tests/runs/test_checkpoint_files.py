@@ -1,8 +1,6 @@
 """Which checkpoint a run resumes or starts from; damaged ones are detected."""
 
-import gc
 import struct
-import sys
 import zipfile
 
 import pytest
@@ -70,8 +68,6 @@ def test_checkpoints_that_are_none_are_named(tmp_path, repository):
         find_checkpoint(text, tmp_path / "new", tmp_path)
     with pytest.raises(InputError, match=r"ckpt_path=last found no .* leave ckpt_path out"):
         find_checkpoint("last", tmp_path / "new", tmp_path)
-    with pytest.raises(InputError, match=r"init_path=none\.ckpt does not exist"):
-        load_weights("none.ckpt", torch.nn.Linear(2, 1))
 
 
 def test_options_that_differ_from_a_checkpoint_s_are_listed():
@@ -98,18 +94,3 @@ def test_weights_in_half_precision_are_loaded(tmp_path):
         assert tensor.dtype == net.state_dict()[name].dtype
     with pytest.raises(InputError, match=r"0\.bias is \(2,\) there and \(3,\) here"):
         load_weights(str(tmp_path / "net.safetensors"), torch.nn.Sequential(torch.nn.Linear(3, 3)))
-
-
-def test_loading_weights_leaves_no_objects_behind(tmp_path):
-    """Five for each tensor with safetensors.torch.load_file, version 0.8.0."""
-    module = torch.nn.Sequential(*(torch.nn.Linear(2, 2) for _ in range(50)))
-    path = tmp_path / "weights.safetensors"
-    save_file(module.state_dict(), path)
-    counts = []
-    gc.freeze()  # collect no more than what is new
-    for _ in range(30):
-        load_weights(str(path), module)
-        gc.collect()
-        counts.append(sys.getallocatedblocks())
-    gc.unfreeze()
-    assert counts[-1] - counts[9] < 20 * 50  # less than half an object for each tensor

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from asysplat.evaluation.metrics import average
-from asysplat.runs.summary import print_evaluation, print_summary, write_json
+from asysplat.runs.summary import print_summary, write_json
 
 METRICS = {
     "protocol/name": "longlrm",
@@ -45,21 +45,6 @@ def test_stages_before_the_last_have_a_row_each(tmp_path, capsys):
     rows = [[cell.strip() for cell in line.split("│")[1:3]] for line in printed if "│" in line]
     assert rows[:2] == [["after stage1", "19.250"], ["after stage2", "20.750"]]
     assert rows[2] == ["trained", "21.500"]
-
-
-@pytest.mark.parametrize("width", [40, 80])
-def test_a_narrow_terminal_has_all_of_an_evaluation(tmp_path, capsys, monkeypatch, width):
-    monkeypatch.setenv("COLUMNS", str(width))
-    numbers = (f"{number / 8:.3f}" for number in range(1, 100))
-    expected = {}
-    for metric in ("psnr", "ssim", "lpips", "absrel", "delta1"):
-        expected |= {f"test/rooms/post{steps}/{metric}": next(numbers) for steps in (0, 100)}
-    results = {key: float(number) for key, number in expected.items()}
-    print_evaluation(METRICS | STATIC | results, ["rooms"], tmp_path)
-    printed = capsys.readouterr().out
-    assert all(number in printed for number in expected.values())
-    assert "delta<1.25" in printed and "…" not in printed
-    assert max(map(len, printed.splitlines()[:-1])) <= width
 
 
 def test_metrics_json_is_finite_and_says_how_seconds_are_taken(tmp_path):
