@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import lightning
 import numpy as np
 import pytest
 import torch
@@ -39,13 +38,6 @@ def with_test_sets(test_sets, **changes):
     return procedural_data(test_sets=test_sets, **(options | changes))
 
 
-@pytest.mark.parametrize("name", ["", "../../x"])
-def test_names_that_no_file_can_have_are_refused(name):
-    for options in ({"name": name}, {"test_sets": {name: list}}):
-        with pytest.raises(InputError, match=r"data\.name or a key of data\.test_sets is "):
-            procedural(**options)
-
-
 def set_up(data):
     data.setup()
     return data
@@ -58,30 +50,9 @@ def assert_same_cameras(sample, expected):
         assert torch.equal(*poses)
 
 
-def epoch_of_scenes(data, epoch, done=0):
-    """The scenes of an epoch that is resumed after `done` batches."""
-    trainer = lightning.Trainer(logger=False, accelerator="cpu", enable_checkpointing=False)
-    loop = trainer.fit_loop
-    loop.epoch_progress.current.processed = epoch
-    loop.epoch_progress.current.completed = epoch
-    loop.epoch_progress.current.ready = epoch + (done > 0)
-    loop.epoch_loop.batch_progress.current.completed = done
-    data.trainer = trainer
-    loader = data.train_dataloader()
-    assert len(loader) == 3
-    return [batch["scene"] for batch in loader]
-
-
 class Trainer:
     def __init__(self, epoch, global_rank=0, world_size=1):
         self.current_epoch, self.global_rank, self.world_size = epoch, global_rank, world_size
-
-
-def test_a_resumed_epoch_has_the_same_scenes():
-    epochs = [epoch_of_scenes(procedural(), epoch) for epoch in range(2)]
-    assert epoch_of_scenes(procedural(), 1) == epochs[1]
-    assert len({name for epoch in epochs for names in epoch for name in names}) == 12
-    assert epoch_of_scenes(procedural(), 1, done=2) == epochs[1][2:]
 
 
 @pytest.mark.medium
@@ -196,15 +167,6 @@ def test_a_test_set_differs_only_in_its_options():
     assert data.tests["procedural"] is data.evaluation["test"]
     views = {name: scenes[0]["inputs"].num_views for name, scenes in data.tests.items()}
     assert views == {"procedural": 3, "rooms": 3, "more_views": 5}
-
-
-def test_a_procedural_source_of_one_kind_of_place_has_its_splits_seeds():
-    places = "outdoors"
-    source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=2, test_scenes=3, places=places)
-    tasks = source.evaluation("val", 3, 2) + source.evaluation("test", 3, 2)
-    tasks += [source.training(3, 2, np.random.default_rng(seed)) for seed in range(3)]
-    seeds = [int(task.sequence.name.removeprefix(f"{places}-")) for task in tasks]
-    assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
 
 
 @pytest.mark.medium

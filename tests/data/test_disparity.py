@@ -1,6 +1,5 @@
 """`python -m asysplat.data.disparity`: its maps, and the training that reads them."""
 
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -142,17 +141,6 @@ def test_maps_and_network_inputs_keep_the_proportions():
     assert shrink(np.zeros((518, 924), np.float32), 540, 960).shape == (272, 484)
     assert shrink(np.zeros((518, 700), np.float32), 20, 27).shape == (20, 27)
     assert network_size(540, 960, 14) == (518, 924) and network_size(960, 540, 14) == (924, 518)
-
-
-def test_missing_transformers_and_non_finite_estimates_are_errors(
-    command, scene, tmp_path, monkeypatch
-):
-    code, _, said = command(scene, estimate=lambda photograph: red(photograph) * np.nan)
-    assert code == 2 and "would hold NaN or infinity" in said
-    assert not list(map_folder(scene, tmp_path / "maps").iterdir())
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    code, _, said = command(scene, estimate=None)
-    assert code == 2 and "pip install 'asysplat[disparity]'" in said
 
 
 def test_depth_anything_by_way_of_transformers_writes_maps(command, scene, tmp_path):

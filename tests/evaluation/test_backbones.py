@@ -1,7 +1,5 @@
 """Weights are downloaded once, into torch's hub cache, if requested; no test uses a network."""
 
-from urllib.error import URLError
-
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -112,12 +110,3 @@ def test_the_option_to_download_reaches_every_user_of_backbones(composed):
     found = list(users(OmegaConf.to_container(config, resolve=True)))
     assert len(found) == 2  # LPIPS and the perceptual term
     assert all(node["download"] is True for node in found)
-
-
-def test_a_failed_download_is_an_input_error(hub, monkeypatch):
-    def fail(*_, **__):
-        raise URLError("no route")
-
-    monkeypatch.setattr("torch.hub.download_url_to_file", fail)
-    with pytest.raises(InputError, match=r"alexnet.* could not be downloaded \(.*paths\.download"):
-        find_backbone("alexnet", None, download=True)

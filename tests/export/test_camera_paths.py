@@ -230,15 +230,6 @@ def test_an_orbit_stays_on_the_side_of_the_cameras(start):
     assert np.abs(np.diff(seen, append=seen[0])).max() < 8
 
 
-def test_an_orbit_of_parallel_cameras_swings_in_front_of_the_middle_one():
-    cameras = cameras_at([[x, 0, 1] for x in (-2, -1, 0, 1, 2)])
-    made = orbit(cameras, 20)
-    assert made.centers[:, 0].abs().max() < 2.1
-    assert made.centers[:, 0].abs().max() > 0.5
-    assert made.cam_to_world[:, 1, 2].min() > math.cos(math.radians(25))
-    torch.testing.assert_close(made.centers[:, 2], torch.ones(20))
-
-
 @pytest.mark.parametrize("case", ["outwards", "one place, all around", "one"])
 def test_an_orbit_swings_a_little_where_no_point_is_seen_by_most(case):
     made = orbit(HARD[case], 20)

@@ -99,27 +99,6 @@ def test_cameras_bring_gaussians_to_the_datas_world(file, sequence, world, other
     check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
 
 
-def test_gaussians_without_cameras_are_in_the_datas_world(file, sequence, world):
-    write_gaussians(file.path, world)
-    found, residual = file.read()
-    assert residual is None
-    torch.testing.assert_close(found.means, world.means.double())
-    check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
-
-
-def test_check_visible_refuses_gaussians_in_other_coordinates(file, sequence):
-    found, _ = file.read()
-    message = (
-        r"room\.v2\.ply: 12 of 12 test views of room show none of its Gaussians, which looks as if "
-        r"they were in other coordinates than the data: put its cameras beside it, "
-        r"room\.v2\.cameras\.json or room\.v2/sparse/0\."
-    )
-    with pytest.raises(InputError, match=message):
-        check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
-    with pytest.raises(InputError, match="give the cameras of this very file"):
-        check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
-
-
 def test_noisy_cameras_beside_a_scene_have_a_residual(file, sequence, other):
     noise = np.random.default_rng(0)
     poses = other_poses(sequence, other)

@@ -2,9 +2,9 @@ import shutil
 
 import numpy as np
 import pytest
-from layouts import assert_listed, opener
 from layouts import colmap as colmap_layout
 from layouts import llff as layout
+from layouts import opener
 
 from asysplat.errors import InputError
 
@@ -32,22 +32,6 @@ def test_images_and_rows_that_differ_in_number_are_refused(scene):
     shutil.rmtree(scene / "images_8")
     with pytest.raises(InputError, match="the images there are none"):
         open_llff(scene)
-
-
-def test_all_bad_images_are_listed_or_left_out(scene):
-    rows = np.load(scene / "poses_bounds.npy")
-    rows[3, 3] = np.nan
-    rows[5, 14] = 0.0  # focal length
-    rows[6, 9] = 100.0  # width
-    np.save(scene / "poses_bounds.npy", rows)
-    assert_listed(
-        open_llff,
-        scene,
-        "row 3 (image003.png) is not 4x4 or holds NaN",
-        "row 5 (image005.png) has focal lengths 0 and 0",
-        "row 6 (image006.png) is 32 x 24 and its intrinsics are for 100 x 192",
-        total=12,
-    )
 
 
 def test_points_of_a_model_beside_the_images_are_read(scene, centered_views, tmp_path):

@@ -14,7 +14,6 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.cameras import CameraOptions, refine_given
 from asysplat.data.check.report import check_scene
 from asysplat.data.images import PANORAMA, undistort
-from asysplat.data.photographs import open_photographs
 from asysplat.data.readers.additions import YAWS, panorama
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
@@ -63,12 +62,12 @@ def write_colmap(folder):
     (model / "points3D.txt").write_text("")
 
 
-def write_transforms(folder, height=HEIGHT, **fields):
+def write_transforms(folder, height=HEIGHT):
     entries = [
         {"file_path": f"images/{name}", "transform_matrix": (pose @ AXES).tolist()}
         for name, pose in zip(NAMES, poses(), strict=True)
     ]
-    content = {"camera_model": PANORAMA, "w": WIDTH, "h": height, **fields, "frames": entries}
+    content = {"camera_model": PANORAMA, "w": WIDTH, "h": height, "frames": entries}
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
@@ -157,12 +156,6 @@ def test_a_mask_beside_a_panorama_is_every_face_s(scene):
     assert (masks[1::3] != expected[1::3]).mean() < 0.03
 
 
-def test_panoramas_become_inputs_and_held_out_views(scene):
-    found = open_photographs(scene, height=64, views=8, held_out_every=4, say=lambda text: None)
-    assert found.inputs.images.shape == (8, 3, 64, 64)
-    assert found.held_out.images.shape == (3, 3, 64, 64) and found.total == 12
-
-
 def test_the_check_does_not_take_faces_for_copies(scene):
     rows = check_scene(opened(scene).scene, BadImages()).rows
     assert not any("same file" in text for _, text in rows)
@@ -181,12 +174,4 @@ def test_panoramas_that_cannot_be_used_are_named(tmp_path):
     save_images(tmp_path)
     write_transforms(tmp_path, height=WIDTH)
     with pytest.raises(InputError, match="w x h is 256 x 256, but the image is 256 x 128"):
-        opened(tmp_path)
-    Image.fromarray(np.ones((HEIGHT, WIDTH), np.uint16)).save(tmp_path / "depth.png")
-    write_transforms(tmp_path, depth_file_path="depth.png")
-    with pytest.raises(InputError, match=r"3 of 3 .*\n.*0\.png is a panorama with a depth map"):
-        opened(tmp_path)
-    write_transforms(tmp_path)
-    save_mask(tmp_path, 2, width=HEIGHT)
-    with pytest.raises(InputError, match=r"1 of 9 .*\n.*masks/2\.png is 128 x 128 and the image"):
         opened(tmp_path)

@@ -34,16 +34,13 @@ def test_bad_poses_are_listed_or_left_out(scene):
 
 
 def test_poses_and_intrinsics_that_cannot_be_used_are_refused(scene):
-    for name, edit, message in (
-        ("poses.txt", lambda text: text[:-200], "number of columns changed"),
-        ("poses.txt", lambda text: text.replace("e", "x", 1), "could not convert"),
-        ("K.txt", lambda text: "-" + text, "has focal lengths -"),
-    ):
-        text = (scene / name).read_text()
-        (scene / name).write_text(edit(text))
-        with pytest.raises(InputError, match=message):
-            open_posed(scene)
-        (scene / name).write_text(text)
+    poses, intrinsics = (scene / name for name in ("poses.txt", "K.txt"))
+    intrinsics.write_text("-" + intrinsics.read_text())
+    with pytest.raises(InputError, match="has focal lengths -"):
+        open_posed(scene)
+    poses.write_text(poses.read_text()[:-200])
+    with pytest.raises(InputError, match="number of columns changed"):
+        open_posed(scene)
 
 
 def test_missing_images_and_poses_are_refused(scene):

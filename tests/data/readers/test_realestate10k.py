@@ -82,15 +82,6 @@ def test_a_bad_image_is_named_or_left_out(chunk, damage, message):
     assert_listed(opened, chunk(damage) / KEY, message)
 
 
-def test_an_absent_chunk_is_named(chunk):
-    file = chunk()
-    file.unlink()
-    with pytest.raises(InputError, match=r"000000.torch does not exist"):
-        opened(file / KEY)
-    with pytest.raises(InputError, match="is no scene in a chunk"):
-        opened(file.parent)
-
-
 class Code:
     """Unpickling it makes a folder."""
 

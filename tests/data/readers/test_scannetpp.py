@@ -152,10 +152,7 @@ def test_a_bad_pose_is_named_or_left_out(iphone):
     assert_listed(opened, iphone, "frame_000002: aligned_pose is not 4x4 or holds NaN")
 
 
-def test_incomplete_downloads_are_refused(iphone, dslr):
-    edit_json(dslr / UNDISTORTED, lambda content: content.update(has_mask=True))
-    with pytest.raises(InputError, match="resized_undistorted_masks does not exist"):
-        opened(dslr)
+def test_a_video_without_its_frames_is_refused(iphone):
     (iphone / "rgb").rename(iphone / "frames")
     (iphone / "rgb.mkv").write_bytes(b"")
     with pytest.raises(InputError, match=r"rgb does not exist: extract rgb.mkv .*ffmpeg"):
