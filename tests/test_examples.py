@@ -98,15 +98,6 @@ def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
     assert before == [] and found == names
 
 
-@pytest.mark.parametrize("command", ["examples/write_scene.py", "-m asysplat.export.viewer"])
-def test_help_imports_nothing_that_takes_long(repository, command):
-    words = [sys.executable, "-X", "importtime", *command.split(), "--help"]
-    said = subprocess.run(words, cwd=repository, capture_output=True, text=True)
-    assert said.returncode == 0 and said.stdout.startswith("usage: ")
-    imported = {line.split("|")[-1].strip() for line in said.stderr.splitlines()}
-    assert "argparse" in imported and not imported & {"torch", "numpy", "rich"}
-
-
 @pytest.mark.medium
 def test_the_commands_for_photographs_are_those_of_the_scripts(repository, tmp_path, run_example):
     """A program in Python's place prints its words."""

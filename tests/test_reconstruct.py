@@ -24,7 +24,7 @@ from pretend_device import DEVICE, pretended_device
 from safetensors import safe_open
 from scipy.spatial.transform import Rotation
 
-from asysplat import Gaussians, read_gaussians, render
+from asysplat import read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
@@ -197,7 +197,9 @@ def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
 
 
 @pytest.mark.medium
-def test_masked_photographs_measure_alike_by_both_scripts(command, views, run_script, tmp_path):
+def test_masked_photographs_measure_alike_by_both_scripts(
+    command, first, views, run_script, tmp_path
+):
     """Before the background that both files name: the evaluation's own inputs have another."""
     photographs = tmp_path / "masked"
     images = views.images.clone()
@@ -208,12 +210,8 @@ def test_masked_photographs_measure_alike_by_both_scripts(command, views, run_sc
     (photographs / "masks").mkdir()
     for path in (photographs / "images").iterdir():
         cv2.imwrite(str(photographs / "masks" / f"{path.stem}.png"), mask)
-    poses = views.cameras.cam_to_world
-    ones = torch.ones(len(poses))
-    before_each_camera = poses[:, :3, 3] + poses[:, :3, 2]
-    shape = torch.eye(4)[:1].expand(len(poses), 4), 0.1 * ones[:, None].expand(-1, 3)
-    start = Gaussians(before_each_camera, *shape, 0.5 * ones, ones[:, None, None].expand(-1, 1, 3))
-    write_ply(tmp_path / "start.ply", start)
+    start = read_gaussians(first[0] / "scene.ply")
+    write_ply(tmp_path / "start.ply", replace(start, opacities=0.1 * start.opacities))
     init = f"init={tmp_path / 'start.ply'}"
     finished(command(photographs, init, "steps=1", "video.path=none"))
     expected = numbers_of(tmp_path / "run")
@@ -401,17 +399,6 @@ def script(repository, monkeypatch):
     on_interrupt = signal.getsignal(signal.SIGINT)
     yield import_module("reconstruct")
     signal.signal(signal.SIGINT, on_interrupt)
-
-
-def test_the_first_word_is_the_path(script):
-    for words, expected in (
-        ("scene", "path='scene'"),
-        ("scene seconds=5", "path='scene' seconds=5"),
-        ("path=scene view=true", "path=scene view=true"),
-        ("--cfg job", "--cfg job"),
-        ("", ""),
-    ):
-        assert script.name_path(words.split()) == expected.split()
 
 
 REFUSED = {

@@ -68,15 +68,15 @@ def make_train(logs, run_script, repository):
         )
 
     @contextmanager
-    def start(*overrides, until, cwd=repository, env=environment):
+    def start(*overrides, until):
         """Yield a process when the logs have a file named `until`; kill it at the end.
 
         It handles SIGINT, even if the shell ignores it for background jobs.
         """
         process = subprocess.Popen(
-            [sys.executable, repository / "train.py", *complete(*overrides)],
-            cwd=cwd,
-            env=env,
+            [sys.executable, "train.py", *complete(*overrides)],
+            cwd=repository,
+            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -92,6 +92,5 @@ def make_train(logs, run_script, repository):
             process.kill()
             process.communicate()
 
-    run.alone, run.start, run.complete, run.environment = run_alone, start, complete, environment
-    run.logs = logs
+    run.alone, run.start, run.complete, run.logs = run_alone, start, complete, logs
     return run

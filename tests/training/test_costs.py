@@ -1,7 +1,6 @@
 """Costs of a test, which are of the network alone, and of a step."""
 
 import mmap
-from types import SimpleNamespace
 
 import lightning
 import pytest
@@ -11,7 +10,6 @@ from tiny_runs import COSTS
 from torch import nn
 from torch.utils.data import DataLoader
 
-from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import CostMeter, reset_peak_memory
 from asysplat.training.callbacks import Costs, costs
 from asysplat.training.module import SplattingModule
@@ -74,13 +72,6 @@ def test_memory_of_each_test_set_is_that_of_its_predictions():
         # Beside a set of the same test: the system may take back pages of the libraries meanwhile.
         rise = costs[key] - costs["small/inference_gb"]
         assert rise == pytest.approx(expected, abs=TOLERANCE_GB)
-
-
-@pytest.mark.medium
-def test_seconds_leave_the_longest_out(monkeypatch):
-    clock = iter([0.0, 1.0, 10.0, 40.0, 50.0, 53.0])  # start and end of each prediction
-    monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    assert measure({"main": [1, 1, 1]})["inference_seconds"] == 2.0
 
 
 def test_seconds_of_steps_are_the_mean_of_all():

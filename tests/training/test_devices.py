@@ -49,12 +49,7 @@ def one(train):
 def check_the_same(found, expected) -> None:
     """The norm of all gradients is summed in fp32, and by process."""
     assert found.curves.keys() == expected.curves.keys()
-    assert {
-        "train/loss",
-        "train/psnr",
-        "train/grad_norm",
-        "val/psnr",
-    } <= found.curves.keys()
+    assert {"train/loss", "train/psnr", "train/grad_norm", "val/psnr"} <= found.curves.keys()
     for name, values in expected.curves.items():
         rel = 1e-4 if name == "train/grad_norm" else 1e-5
         assert len(values) == 2 and found.curves[name] == pytest.approx(values, rel=rel), name

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -93,15 +94,15 @@ def test_a_file_has_every_image(whole, evaluated):
     assert mean == pytest.approx(evaluated["test/rooms/post3/psnr"], abs=1e-4)
 
 
+def fill_state_of_the_art(composed, *measured):
+    """Table 2, with what was measured of one stage at the tiny size."""
+    tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, "stage=stage1", "earlier_stages=[]"]
+    table, compose = load_paper()["state_of_the_art"], partial(composed, return_hydra_config=True)
+    return fill_table(table, tiny, lambda overrides: compose(*overrides), *measured)
+
+
 def test_the_report_has_rows_with_post_optimization(whole, evaluated, composed):
-    one_stage = ["stage=stage1", "earlier_stages=[]"]
-    tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, *one_stage]
-    filled = fill_table(
-        load_paper()["state_of_the_art"],
-        tiny,
-        lambda overrides: composed(*overrides, return_hydra_config=True),
-        finished_runs(whole.parents[1]),
-    )
+    filled = fill_state_of_the_art(composed, finished_runs(whole.parents[1]))
     rows = {r.post_optimization: r for r in filled.rows if r.name.startswith("AsySplat")}
     for steps in (3, 10):
         values = rows[steps].values
@@ -143,10 +144,8 @@ def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path,
     read_evaluation(again)
     assert measured == [] and re.search(r"measured before, as \S+ has them: 6 scenes", again.stdout)
     stored = min(kept)
-    for damage in ("{", "[]", "{}"):
-        stored.write_text(damage)
-        refused = evaluate(*command, STEPS)
-        assert f"error: {stored} is" in refused.stderr and "Traceback" not in refused.stderr
+    stored.write_text("{")
+    assert refusal(evaluate(*command, STEPS)).startswith(f"error: {stored} is")
     alone = "data.test_sets=null"
     read_evaluation(evaluate(*command, "post_optimization_steps=[0,2]", alone))
     assert measured == ["procedural-0", "procedural-1"]
@@ -216,13 +215,8 @@ def test_another_systems_coordinates(written, photographs, evaluate, tmp_path):
     system.mkdir()
     moved = transform(read_gaussians(file), motion).scale_by(2.5)
     write_gaussians(system / f"{photographs.name}.ply", moved)
-    data = [
-        f"gaussians={system}",
-        *ON_DISK,
-        f"data.root={photographs}",
-        *VIEWS,
-        "post_optimization_steps=0",
-    ]
+    data = [f"gaussians={system}", *ON_DISK, f"data.root={photographs}", *VIEWS]
+    data += ["post_optimization_steps=0"]
     said = refusal(evaluate(*data))
     assert "other coordinates than the data: put its cameras beside it" in said
     assert not list(tmp_path.rglob("evaluation"))  # before any scene is measured
@@ -268,24 +262,15 @@ def test_images_measure_as_the_gaussians_that_they_show(written, photographs, ev
 REFINED = [*SIZE, *VIEWS, *TINY_SCENES, "metrics=longlrm"]
 
 
-def test_3dgs_is_fitted_to_each_test_scene(evaluate, composed, tmp_path):
-    """It fills its row of Table 2, with its seconds; the same command measures the same."""
+def test_3dgs_is_fitted_to_each_test_scene(evaluate, composed):
+    """It fills its row of Table 2, with its seconds."""
     command = ["refinement=3dgs", "refinement_steps=40", "post_optimization_steps=0", *REFINED]
     folder, found = read_evaluation(evaluate(*command))
     assert found["evaluation/system"] == "3dgs" and found["tested/scenes"] == 2
     psnr = found["test/procedural/post0/psnr"]
     assert psnr > found["baseline/procedural/mean_color/psnr"]
     assert found["inputs/procedural/post0/psnr"] > psnr and found["cost/post0/seconds"] > 0
-    again = evaluate(*command, f"paths.logs={tmp_path}/again")
-    assert qualities(read_evaluation(again)[1]) == qualities(found)
-
-    filled = fill_table(
-        load_paper()["state_of_the_art"],
-        [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, "stage=stage1", "earlier_stages=[]"],
-        lambda overrides: composed(*overrides, return_hydra_config=True),
-        {},
-        list(find_systems(folder)),
-    )
+    filled = fill_state_of_the_art(composed, {}, list(find_systems(folder)))
     row = next(row for row in filled.rows if row.name.startswith("3DGS"))
     assert row.values["dl3dv/psnr"] == [psnr]
     assert row.values["inference_seconds"] == [found["cost/post0/seconds"]]
@@ -300,29 +285,11 @@ def test_scaffold_gs_is_drawn_view_by_view(evaluate):
     assert psnr > found["baseline/procedural/mean_color/psnr"]
 
 
-def test_files_that_do_not_fit_the_data(written, photographs, evaluate, tmp_path):
-    ours, _ = written
-    data = [*ON_DISK, f"data.root={photographs}", *VIEWS]
-    (tmp_path / "lego.ply").touch()
-    assert "lego.ply is named as no scene of the data" in refusal(
-        evaluate(f"gaussians={tmp_path}", *data)
-    )
-    assert "is not an empty folder: name a new one" in refusal(
-        evaluate("init_path=shipped", f"write_gaussians={ours}", *data)
-    )
-    (tmp_path / "lego.ply").rename(tmp_path / f"{photographs.name}.ply")
-    assert f"{photographs.name}.ply" in refusal(evaluate(f"gaussians={tmp_path}", *data))  # empty
-    synthetic = evaluate(f"gaussians={next(ours.iterdir())}", *VIEWS, *TINY_SCENES)
-    assert "is one scene, and the data has 2" in refusal(synthetic)
-    assert not list(tmp_path.rglob("evaluation*.*"))
-
-
-@pytest.mark.parametrize("system", ["pixelSplat", "MVSplat"])
-def test_files_that_lose_their_scene_are_refused_by_name(evaluate, tmp_path, system):
-    (tmp_path / system).mkdir()
-    (tmp_path / system / "room.ply").touch()
-    said = refusal(evaluate(f"gaussians={tmp_path / system}", "data=files", "data.root=rooms"))
-    assert f"of {system}: the PLY files that it writes have scaled positions" in said
+def test_files_that_lose_their_scene_are_refused_by_name(evaluate, tmp_path):
+    (tmp_path / "pixelSplat").mkdir()
+    (tmp_path / "pixelSplat" / "room.ply").touch()
+    said = refusal(evaluate(f"gaussians={tmp_path}/pixelSplat", "data=files", "data.root=rooms"))
+    assert "of pixelSplat: the PLY files that it writes have scaled positions" in said
     assert "images=FOLDER" in said
 
 
@@ -336,19 +303,12 @@ def refusal(result) -> str:
 REFUSED = {
     "nothing": ([], "nothing is given to evaluate: give one of"),
     "two at once": (["run=last", "init_path=shipped"], "run and init_path is given"),
-    "no run": (["run=nowhere"], "run=nowhere has no metrics.json"),
     "no runs": (["run=last"], "run=last found no finished run in"),
-    "no weights": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
-    "no file": (["gaussians=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
     "no data": (["gaussians=none.ply"], "is measured on photographs of the same scenes: add data="),
     "a name of nothing": (["init_path=shipped", "system=x"], "system=x names the system that made"),
     "files to write": (
         ["gaussians=a", "data=files", "write_gaussians=b"],
         "writes what a network predicts, of run=... or init_path=...",
-    ),
-    "no images": (
-        ["images=none", "data.test_scenes=1", "post_optimization_steps=0"],
-        "images=none is no folder",
     ),
     "post-optimization of images": (
         ["images=none", "data.test_scenes=1", "post_optimization_steps=3"],
@@ -358,22 +318,10 @@ REFUSED = {
         ["refinement=3dgs", "refinement_seconds=0"],
         "refinement_seconds=0 should be greater than 0.",
     ),
-    "half a step": (
-        ["refinement=3dgs", "refinement_steps=0.5"],
-        "refinement_steps=0.5 should be a valid integer.",
-    ),
-    "an unknown refinement": (["refinement=nerf"], "refinement/nerf"),
-    "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
         "the shipped weights do not fit this model, ",
     ),
-    "steps that do not increase": (
-        ["init_path=shipped", "post_optimization_steps=[3,3]"],
-        "above the one before",
-    ),
-    "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0 should be"),
-    "an unknown option": (["ryn=last"], "override 'ryn'"),
 }
 
 

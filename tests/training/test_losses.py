@@ -19,7 +19,6 @@ from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training import InputDisparity, LogDepth, Prediction, RenderedDisparity, SplattingLoss
 from asysplat.training.losses.disparity import (
     disparity_distance,
-    normalized_disparity,
     own_depths,
     reference_disparities,
 )
@@ -61,14 +60,6 @@ def pair(size=32, depths=True):
     )
     prediction = Prediction(gaussians_at(torch.ones(2 * size * size, 3)), rendering)
     return prediction, {"inputs": targets, "targets": targets}
-
-
-def test_normalized_disparity_by_hand():
-    disparity = torch.tensor([[[1.0, 2.0], [4.0, 7.0]]])
-    valid = torch.tensor([[[True, True], [True, False]]])
-    # Disparities 1, 2, 4: median 2, mean absolute deviation (1 + 0 + 2) / 3.
-    expected = torch.tensor([[[-1.0, 0.0], [2.0, 0.0]]])
-    torch.testing.assert_close(normalized_disparity(disparity, valid), expected)
 
 
 def test_nearly_constant_depths_have_no_greater_gradients_than_others():
@@ -127,7 +118,7 @@ def test_rendered_disparity_by_hand():
     assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
 
 
-@pytest.mark.parametrize(("size", "stride"), [(4, 1), (8, 2), (16, 4)])
+@pytest.mark.parametrize(("size", "stride"), [(4, 1), (16, 4)])
 def test_the_stride_is_that_of_the_gaussians(size, stride):
     """p_c / p_f: 16 Gaussians of one view. Another can be given."""
     views = Views(cameras(size, views=1), torch.rand(1, 3, size, size), torch.ones(1, size, size))
@@ -270,19 +261,6 @@ def test_the_ssim_term_is_what_ssim_lacks_of_1():
     image, targets = prediction.rendering.image, batch["targets"].images
     assert terms["ssim"] == 1 - ssim(image, targets).mean() and terms["ssim"] > 0.5
     assert terms["loss"] == 0.5 * F.mse_loss(image, targets) + 2 * terms["ssim"]
-
-
-def test_what_ran_is_described(distances):
-    distance, _ = distances["longlrm"]
-    options = {"ssim": 0.05, "perceptual_term": lambda: distance}
-    loss = make_loss(mse=1.0, perceptual=0.5, depth=0.01, **options)
-    described = loss.describe()
-    assert described == f"1 mse, 0.05 ssim, 0.5 perceptual ({distance.content}), 0.01 depth"
-    assert distance.content != distances["vgg16"][0].content and len(distance.content) == 16
-    loss = make_loss(mse=1.0, depth=0.01)
-    with pytest.warns(UserWarning, match="without this term"):
-        loss(*pair(depths=False))
-    assert loss.describe() == "1 mse"
 
 
 def test_data_without_depth_is_refused_where_it_is_not_allowed():

@@ -4,12 +4,11 @@ import math
 from functools import partial
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 from hydra.utils import instantiate
+from test_checkpoints import Numbers
 from tiny import OneLayer
-from torch.utils.data import DataLoader
 
 from asysplat.evaluation.static_cost import blank_views
 from asysplat.scene import Cameras, Views
@@ -32,10 +31,7 @@ def make_module(net, background=(0.5, 0.5, 0.5), warmup_steps=1, total_steps=2, 
     )
 
 
-UNREAD = {
-    "asysplat_pred_coarse": "appearance.links.2.",
-    "asysplat_pred_fine": "geometry.links.2.",
-}
+UNREAD = {"asysplat_pred_coarse": "appearance.links.2.", "asysplat_pred_fine": "geometry.links.2."}
 
 
 @pytest.mark.medium
@@ -94,15 +90,6 @@ def test_a_step_with_a_gradient_above_5_times_the_clip_changes_nothing(build, no
 
 
 @pytest.mark.medium
-def test_a_branch_that_nothing_reads_is_not_trained(build):
-    overrides = ("model/fusion=fine", "model/links=only_fine_to_coarse", "width=0.125")
-    net = make_module(build(*overrides, "state_size=8")).net
-    assert not any(p.requires_grad for p in net.geometry.parameters())
-    assert all(p.requires_grad for p in net.appearance.parameters())
-    assert all(isinstance(p, torch.nn.Parameter) and not p.is_meta for p in net.parameters())
-
-
-@pytest.mark.medium
 def test_the_background_follows_the_inputs(build):
     """What no Gaussian covers has the mean color of each scene's inputs."""
     module = make_module(build("width=0.125", "state_size=8"), "inputs")
@@ -141,15 +128,7 @@ def test_linear_warm_up_then_a_cosine_to_zero():
     assert rates(warmup_steps=2, total_steps=2, steps=3) == pytest.approx([0.2, 0.4, 0.4])
 
 
-STEPS, PER_EPOCH = 6, 2
-
-
-class Numbers(lightning.LightningDataModule):
-    """Task i is the number i."""
-
-    def train_dataloader(self):
-        start = self.trainer.current_epoch * PER_EPOCH
-        return DataLoader(range(start, start + PER_EPOCH), batch_size=None)
+STEPS = 6
 
 
 class TaskRecorder(OneLayer):

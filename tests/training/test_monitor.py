@@ -6,15 +6,13 @@ from unittest.mock import Mock
 import lightning
 import pytest
 import torch
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
-from lightning.pytorch.loggers import wandb
-from lightning_utilities.core.imports import RequirementCache
 from torch import nn
 
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms
 from asysplat.training.module import SplattingModule
+
+CPU = torch.device("cpu")
 
 
 def test_rates_are_those_of_all_steps_but_not_of_validations(monkeypatch):
@@ -22,7 +20,7 @@ def test_rates_are_those_of_all_steps_but_not_of_validations(monkeypatch):
     monkeypatch.setattr(monitor.time, "perf_counter", lambda: clock.now)
     logger = SimpleNamespace(log_metrics=lambda numbers, step: logged.update({step: numbers}))
     trainer = Mock(lightning.Trainer, global_step=0, world_size=2, loggers=[logger])
-    module = Mock(SplattingModule, device=torch.device("cpu"), net=nn.ModuleDict())
+    module = Mock(SplattingModule, device=CPU, net=nn.ModuleDict())
     views = [SimpleNamespace(num_views=count) for count in (3, 2)]
     batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
     watch = TrainingMonitor(every=2)
@@ -47,9 +45,3 @@ def test_gradient_norms_by_part():
     net["geometry"].bias.grad = torch.tensor([4.0])
     net["head"].bias.grad = torch.tensor([-2.0])
     assert gradient_norms(net) == {"gradient/geometry": 5, "gradient/head": 2}
-
-
-def test_error_without_wandb(monkeypatch, composed):
-    monkeypatch.setattr(wandb, "_WANDB_AVAILABLE", RequirementCache("wandb>=1000"))
-    with pytest.raises(InstantiationException, match=r"wandb.* not met"):
-        instantiate(composed("logger=wandb", "paths.run=unused").logger)

@@ -58,13 +58,6 @@ def test_lines_after_each_validation_without_a_terminal(tmp_path, capsys):
     assert [line.split(",")[0] for line in output] == ["step 8 of 10", "step 10 of 10"]
 
 
-def test_lines_between_validations(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(loggers, "LINE_SECONDS", 0)
-    fit(tmp_path, 2)
-    steps = [line.split(",")[0].split(":")[0] for line in lines(capsys.readouterr().out)]
-    assert steps == ["step 1 of 2", "step 2 of 2", "step 2 of 2"]  # the last after the validation
-
-
 def test_bars_on_a_terminal_alone(monkeypatch):
     assert isinstance(loggers.show_progress(), loggers.ProgressLines)
     monkeypatch.setattr(loggers.sys.stdout, "isatty", lambda: True)

@@ -92,10 +92,7 @@ SLOW = (pytest.mark.slow, pytest.mark.timeout(3600))
 
 @pytest.mark.parametrize(
     ("kills", "longest", "steps", "validate_every"),
-    [
-        pytest.param(1, 2, 4, 2, marks=pytest.mark.medium),
-        pytest.param(20, 6, 150, 10, marks=SLOW),
-    ],
+    [pytest.param(1, 2, 4, 2, marks=pytest.mark.medium), pytest.param(20, 6, 150, 10, marks=SLOW)],
 )
 def test_a_killed_run_ends_with_the_same_bits_and_logs(
     train, kills, longest, steps, validate_every
@@ -112,25 +109,6 @@ def test_a_killed_run_ends_with_the_same_bits_and_logs(
     finished(train("name=whole", *options, "ckpt_path=last"))
     assert events.scalars(whole) == before
     check_same(whole, folder_of(train, "killed"))
-
-
-@pytest.mark.slow
-def test_a_clock_that_jumps_changes_nothing(train, monkeypatch):
-    options = [*OPTIONS, "steps=4", "validate_every=2"]
-    whole = finished(train("name=whole", *options))
-    jumps, clock = random.Random(0), time.time
-    monkeypatch.setattr(time, "time", lambda: clock() + jumps.uniform(-86_400, 86_400))
-    jumped = finished(train("name=jumped", *options))
-    weights = [load_weights(folder) for folder in (whole, jumped)]
-    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
-    assert rows(whole / "metrics.csv") == rows(jumped / "metrics.csv") != []
-    # The times of events jump, too, and so which of a result and its place before it is the last.
-    logged = [events.scalars(folder) for folder in (whole, jumped)]
-    logged = [{k: v for k, v in row.items() if not k.startswith("hp/")} for row in logged]
-    assert logged[0] == logged[1] != {}
-    with (jumped / "curve.csv").open() as file:
-        minutes = [float(row["minutes"]) for row in csv.DictReader(file)]
-    assert minutes == sorted(minutes) and minutes[0] >= 0 and minutes[-1] < 10
 
 
 @pytest.mark.medium

@@ -9,7 +9,6 @@ import torch
 from hydra.utils import instantiate
 from tiny import NETWORK, QUIET, SCENES, VIEWS
 
-from asysplat.runs.summary import print_summary
 from asysplat.training.callbacks import Figures, Metrics
 from asysplat.training.callbacks.metrics import gather
 
@@ -52,7 +51,6 @@ def together(measure):
 ALONE = {
     "procedural": [],
     "rooms": ["data.places=rooms"],
-    "outdoors": ["data.places=outdoors"],
     "more_views": ["data.inputs=5", "data.test_scenes=2"],
     "wide": ["data.width=64"],
 }
@@ -73,16 +71,6 @@ def test_only_the_main_set_is_drawn(measure, together):
     alone = measure("data.test_sets=null")
     (drawn,), (expected,) = ((run.folder / "figures").iterdir() for run in (together, alone))
     assert drawn.name == "test-0.png" and drawn.read_bytes() == expected.read_bytes()
-
-
-def test_the_summary_shows_every_set(together, capsys):
-    print_summary(together.results | {"cost/peak_gb": 2.0}, "procedural", together.folder)
-    printed = capsys.readouterr().out
-    assert "2.00 GB at most" in printed
-    for name in ("rooms", "outdoors", "more_views"):
-        (line,) = (line for line in printed.splitlines() if name in line)
-        for key in ("test/{}", "baseline/{}/nearest_view", "baseline/{}/mean_color"):
-            assert f"{together.results[key.format(name) + '/psnr']:.3f}" in line
 
 
 def test_processes_count_an_image_once_in_each_set(monkeypatch):
