@@ -34,10 +34,7 @@ def input_error_behind(error: BaseException) -> InputError | None:
 
 
 def first_mistake(error: Any, title: str | None = None) -> InputError:
-    """Return the first mistake that a ValidationError of pydantic lists, as a sentence.
-
-    `title` is the name of the option that was checked; None: that of a dataclass of options.
-    """
+    """Return the first mistake that pydantic lists, of the option `title` or a dataclass's."""
     first = error.errors()[0]
     if "error" in first.get("ctx", {}):  # raised by a dataclass itself
         return InputError(str(first["ctx"]["error"]))

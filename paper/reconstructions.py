@@ -13,11 +13,11 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import BASELINES, METRICS
 from asysplat.export.gaussians import WRITERS
 from asysplat.export.page import PAGE
-from asysplat.files import atomic_write, make_folder
+from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.root import typed
 from asysplat.runs.run_config import flat_options
 from asysplat.runs.runs import PICTURE, RECONSTRUCTION, RESULTS, files_below
-from asysplat.runs.summary import metric_cells, read_results
+from asysplat.runs.summary import metric_cells
 from asysplat.terminal import make_console
 from paper.grid import Cell, Grid, Heading
 from paper.html import TEMPLATES
@@ -75,7 +75,7 @@ def read_reconstructions(folder: Path) -> list[Reconstruction]:
     for path in reversed(files_below(folder, RESULTS)):
         if any((path.parent / name).exists() for name in RECONSTRUCTION):
             options = OmegaConf.to_container(OmegaConf.load(path.parent / "config.yaml"))
-            runs.append(Reconstruction(path.parent, read_results(path), flat_options(options)))
+            runs.append(Reconstruction(path.parent, read_json(path), flat_options(options)))
     return sorted(runs, key=lambda run: Path(run.options["path"]).name.casefold())
 
 

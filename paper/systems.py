@@ -7,9 +7,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from asysplat.files import read_json
 from asysplat.runs.evaluation_target import SYSTEM, options_of_test
 from asysplat.runs.runs import EVALUATION, Run, files_below
-from asysplat.runs.summary import TESTED, read_results
+from asysplat.runs.summary import TESTED
 from paper.notes import data_text
 from paper.tables import Number, PaperRow, PaperTable
 
@@ -20,7 +21,7 @@ COSTS = {"inference_seconds": "cost/post0/seconds", "inference_gb": "cost/post0/
 def find_systems(logs: Path) -> Iterator[Run]:
     """Yield every finished evaluation of another system below `logs`, oldest first."""
     for path in files_below(logs, EVALUATION):
-        results = read_results(path)
+        results = read_json(path)
         if SYSTEM in results:
             described = (
                 results[f"evaluation/{key}"] for key in ("config_hash", "seed", "revision")

@@ -87,9 +87,9 @@ def _data_module(
             )
         for option in changes:
             if option not in changeable:
+                known = ", ".join(changeable)
                 raise InputError(
-                    f"{where}.{option} is no option of a test set: give any of "
-                    f"{', '.join(changeable)}."
+                    f"{where}.{option} is no option of a test set: give any of {known}."
                 )
         sets[test_set] = partial(_test_tasks, make_source, **{**main, **changes})
     module |= size | {"on_error": options.get("on_error", "fail")}

@@ -67,19 +67,17 @@ class SceneDataModule(lightning.LightningDataModule):
 
     Args:
         name: the data set's name in metrics.
-        source: where tasks come from.
         inputs, targets: number of input views and of views to predict, per scene.
         height, width: size in pixels of every view from `source`; test sets may have another.
         batch_size: scenes of an optimizer step, of all processes together.
         num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: seed of the training tasks.
-        steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that returns its tasks; one with the
             data set's name replaces the source's test.
         augmentation: random changes of training tasks; None changes nothing.
         points: whether the inputs have the depths of the scene's sparse points.
-        on_error: where the files of a training scene cannot be used: "fail", or "skip" to draw
-            another scene, as its images are left out. A batch's `bad_scenes` lists the errors.
+        on_error: where a training scene cannot be used, "fail", or "skip" to draw another; a
+            batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its scenes.
         growth_steps: optimizer steps in which the window of the training tasks grows.
 
@@ -150,23 +148,22 @@ class SceneDataModule(lightning.LightningDataModule):
                 )
 
     @contextmanager
-    def _naming(self, test_set: str) -> Generator[None]:
+    def _naming(self, test_set: str, main: str | None = None) -> Generator[None]:
+        """Name a test set in the InputErrors of the body; the data set's own only as `main`."""
         try:
             yield
         except InputError as error:
-            if test_set == self.name:
+            where = main if test_set == self.name else f"data.test_sets.{test_set}"
+            if where is None:
                 raise
-            raise InputError(f"data.test_sets.{test_set}: {error}") from error
+            raise InputError(f"{where}: {error}") from error
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
         check(self.height, self.width)
         for name, tasks in self.tests.items():
-            try:
+            with self._naming(name, "data.test_size"):
                 check(*tasks[0]["inputs"].images.shape[-2:])
-            except InputError as error:
-                where = "data.test_size" if name == self.name else f"data.test_sets.{name}"
-                raise InputError(f"{where}: {error}") from error
 
     def check_views(self, check: Callable[[int], None]) -> None:
         """Call `check(inputs)` for every set; its InputError names the set."""

@@ -45,12 +45,10 @@ def find_backbone(
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if backbone_dir is not None:
         candidates.append(Path(backbone_dir) / f"{name}_features_fp16.pth")
-    path = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if path is not None:
-        return _features(name, _read(name, path), path)
-    if download:
-        return _features(name, _download(name), _hub_cache())
-    return None
+    for path in candidates:
+        if path.is_file():
+            return _features(name, _read(name, path), path)
+    return _features(name, _download(name), _hub_cache()) if download else None
 
 
 def _hub_cache() -> Path:

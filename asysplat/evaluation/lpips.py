@@ -17,10 +17,7 @@ MIN_SIDE = 32  # pixels
 def load_lpips(
     net: Literal["alex", "vgg"], backbone_dir: Path | None, download: bool = False
 ) -> nn.Module | None:
-    """Build the frozen LPIPS network; None if `find_backbone` does not find its backbone.
-
-    The linear heads come with the lpips package.
-    """
+    """Build the frozen LPIPS network; None if `find_backbone` does not find its backbone."""
     import lpips  # not above: it imports torchvision, which takes as long as torch
 
     backbone = find_backbone("alexnet" if net == "alex" else "vgg16", backbone_dir, download)

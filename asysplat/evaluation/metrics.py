@@ -104,10 +104,7 @@ def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") 
 
 
 def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:
-    """Compute the fraction of pixels with max(depth / target, target / depth) < 1.25.
-
-    Only pixels with target > 0 count. Arguments and NaN as in `abs_rel`.
-    """
+    """Compute the fraction of known pixels with max(depth / target, target / depth) < 1.25."""
     depth, target, valid = _prepare(depth, target_depth, alignment)
     # Without a division, a depth <= 0 is wrong rather than NaN.
     close = (depth < DELTA * target) & (target < DELTA * depth)

@@ -14,10 +14,8 @@ from asysplat.scene import Cameras, Gaussians
 
 
 def blending_weights(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "N"]:
-    """Compute the sum of each Gaussian's blending weights over all pixels of all views.
-
-    An image is linear in the Gaussians' colors, with these weights as its gradient.
-    """
+    """Compute the sum of each Gaussian's blending weights over all pixels of all views."""
+    # An image is linear in the Gaussians' colors, with these weights as its gradient.
     gray = torch.zeros_like(gaussians.sh[:, :1], requires_grad=True)
     with torch.enable_grad():
         for view in range(cameras.num_views):

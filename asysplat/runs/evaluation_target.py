@@ -139,8 +139,7 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
         if key not in (*OWN_OPTIONS, DEVICE) and not key.startswith("paths."):
             raise InputError(
                 f"{key} does not go with run={options.run}, which is measured as it was tested: "
-                f"leave it out, or give init_path={checkpoint} and the run's options instead of "
-                "run."
+                f"leave it out, or give init_path={checkpoint} and the run's options instead."
             )
     config = read_config(folder / "config.yaml")
     config.init_path = str(checkpoint)

@@ -16,11 +16,11 @@ from omegaconf import MISSING, DictConfig, open_dict
 
 from asysplat.data.sources import tested_sets
 from asysplat.errors import InputError
+from asysplat.files import read_json
 from asysplat.runs.checkpoints import weights_file
 from asysplat.runs.machine import revision
 from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
-from asysplat.runs.summary import read_results
 
 RESULTS = "metrics.json"
 PICTURE = "contact.png"  # in the folder of a reconstruction
@@ -156,18 +156,17 @@ def find_runs(logs: Path) -> Iterator[Run]:
         if any((path.parent / name).exists() for name in RECONSTRUCTION):
             continue
         try:
-            results = read_results(path)
+            results = read_json(path)
             described = (results[f"run/{key}"] for key in ("config_hash", "seed", "revision"))
             run = Run(path.parent, *described, results)
             extra = path.with_name(EVALUATION)
             if extra.exists():
-                results.update(read_results(extra))
+                results.update(read_json(extra))
         except (ValueError, KeyError, TypeError):
-            warnings.warn(
-                f"{path} is not the results of a finished run: it is left out.", stacklevel=2
-            )
-            continue
-        yield run
+            what = "is not the results of a finished run: it is left out."
+            warnings.warn(f"{path} {what}", stacklevel=2)
+        else:
+            yield run
 
 
 def find_reconstructions(logs: Path) -> list[Path]:
@@ -196,11 +195,10 @@ def folder_of(
                 f"run=last found no finished run in {logs}: name its folder, or set paths.logs=."
             )
         folder = folders[-1]
-    for file in files:
-        if not (folder / file).is_file():
-            raise InputError(
-                f"run={run} has no {file}: name the folder of a finished run, or last."
-            )
+    if missing := [file for file in files if not (folder / file).is_file()]:
+        raise InputError(
+            f"run={run} has no {missing[0]}: name the folder of a finished run, or last."
+        )
     return folder
 
 

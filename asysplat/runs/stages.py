@@ -64,10 +64,7 @@ def describe_stage(config: DictConfig) -> str:
 
 
 def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple[int, Results]:
-    """Find where a run resumes: the index of the checkpoint's stage, and the results before it.
-
-    A checkpoint without the name of a stage counts as one of the first.
-    """
+    """Find where a run resumes: the index of the checkpoint's stage, and the results before it."""
     if checkpoint is None:
         return 0, {}
     names = [stage.stage for stage in stages]

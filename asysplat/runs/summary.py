@@ -6,10 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.evaluation.metrics import BASELINES, METRICS
-from asysplat.files import atomic_write, read_json
+from asysplat.files import atomic_write
 from asysplat.terminal import make_console, print_table
 
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
@@ -32,14 +31,6 @@ def write_json(path: Path, results: Results) -> None:
     finite["protocol/seconds"] = SECONDS
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
-
-
-def read_results(path: Path) -> Results:
-    """Read what `write_json` wrote."""
-    results = read_json(path)
-    if not isinstance(results, dict):
-        raise InputError(f"{path} is not the results of a run: copy the run again.")
-    return results
 
 
 def metric_cells(results: Results, prefix: str, metrics: Iterable[str] = METRICS) -> list[str]:

@@ -27,7 +27,6 @@ class SplattingModule(lightning.LightningModule):
 
     Args:
         net: views -> Gaussians; see `freeze_unused`.
-        loss: compares a prediction with its batch.
         optimizer: parameter groups -> optimizer; only `decaying` parameters have weight decay.
         matrix_optimizer: matrices -> optimizer, of `block_matrices`; None: as the others.
         schedule: optimizer -> its learning rates, one for each step.
@@ -35,8 +34,7 @@ class SplattingModule(lightning.LightningModule):
             views; in training black or white, whichever is less like that mean, so that
             transparent Gaussians never lower the loss.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
-        views_at_once: render this many targets of each scene at a time, and again in the backward
-            pass, to save memory; None: all at once. See `render`.
+        views_at_once: targets of each scene that are rendered at a time; None: all. See `render`.
         drop_above: drop a step whose gradient's norm is above this multiple of the trainer's
             gradient_clip_val, as Long-LRM does; None: drop none.
     """

@@ -94,12 +94,10 @@ class ParallelScenes:
 
 
 class ShardedStrategy(ModelParallelStrategy):
-    """Shards weights and batches among all processes of all nodes (FSDP2, also on CPUs).
-
-    A checkpoint is one file with all weights, which a single process can read too.
-    """
+    """Shards weights and batches among all processes of all nodes (FSDP2, also on CPUs)."""
 
     def __init__(self):
+        # A checkpoint is one file with all weights, which a single process can read too.
         super().__init__(tensor_parallel_size=1, save_distributed_checkpoint=False)
 
     def setup_environment(self) -> None:

@@ -177,7 +177,11 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         checkpoint = find_checkpoint(config.ckpt_path, folder, runs, say=_say)
         first, results = resume_point(checkpoint, configs)
         weights = config.init_path if checkpoint is None else None
-        check_start(configs[first], checkpoint, weights)
+        file = checkpoint if weights is None else existing_weights(weights)
+        if file is not None:  # fits the model, before any scene is made
+            with torch.device("meta"):
+                net = instantiate(configs[first].model)
+            check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
         stages: list[TrainingStage] = []
         for stage in configs[first:]:
             if stage is not config:
@@ -187,20 +191,9 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         yield PreparedRun(config, fingerprint, stages, results)
 
 
-def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None) -> None:
-    """Check that the file to resume or start from fits the model, before any scene is made."""
-    file = existing_weights(weights) if weights is not None else checkpoint
-    if file is not None:
-        with torch.device("meta"):
-            net = instantiate(config.model)
-        check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
-
-
 def drop_missing_perceptual_term(config: DictConfig) -> None:
-    """Set the weight of the perceptual term to 0 if its network is not on this machine.
-
-    The run is then hashed and recorded as what it is, a run without the term.
-    """
+    """Set the weight of the perceptual term to 0 if its network is not on this machine."""
+    # The run is then hashed and recorded as what it is, a run without the term.
     loss = config.training.loss
     if loss.perceptual:
         try:

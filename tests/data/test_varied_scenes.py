@@ -7,8 +7,8 @@ from torch.nn.functional import max_pool2d
 
 from asysplat.data import ProceduralSource
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.procedural.edges import SAMPLES, average_samples, edge_pixels, sample_directions
 from asysplat.data.procedural.path import circle, forward, hand_held_path, pan
+from asysplat.data.procedural.scene import SAMPLES, average_samples, edge_pixels, sample_directions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SEEDS = range(3)

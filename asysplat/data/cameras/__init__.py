@@ -50,10 +50,7 @@ def find_missing(
 def refine_given(
     scene: PosedScene, options: CameraOptions, say: Callable[[str], None]
 ) -> tuple[PosedScene, bool]:
-    """Return a scene with refined cameras, if they are wanted, or better and "auto".
-
-    And whether so many features agree with the given cameras that these are not wrong.
-    """
+    """Return a scene with refined cameras where wanted, and whether the given ones are right."""
     if options.choice not in ("auto", "refined"):
         return scene, False
     images = [image for image in scene.images if image.lens.model != PANORAMA]

@@ -99,8 +99,7 @@ def find_cameras(
         if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
-                "photographs: too few show the same place; photograph it with more overlap, from "
-                "different places."
+                "photographs: too few show the same place; photograph it with more overlap."
             )
         keep(work, model, folder)
     return folder

@@ -144,9 +144,8 @@ def epipolar_lines(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]
     """
     rotations = cameras.cam_to_world[..., :3, :3]
     # The plane through a ray of one view and the center of the other is a line in the other view.
-    planes = torch.linalg.cross(
-        _baseline(cameras, matches)[:, None].expand(-1, 2, -1), _rays(cameras, matches)
-    )
+    baseline = _baseline(cameras, matches)[:, None].expand(-1, 2, -1)
+    planes = torch.linalg.cross(baseline, _rays(cameras, matches))
     to_pixels = torch.linalg.inv(cameras.intrinsics).mT @ rotations.mT
     lines = (to_pixels[matches.indices] @ planes.flip(1)[..., None])[..., 0]
     return lines / lines[..., :2].norm(dim=-1, keepdim=True)

@@ -5,11 +5,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.data.procedural.clutter import add_clutter, polish
-from asysplat.data.procedural.edges import SAMPLES, average_samples, edge_pixels, sample_directions
 from asysplat.data.procedural.floor_plan import furnished_room, outdoor_place
 from asysplat.data.procedural.path import above, arc, circle, forward, hand_held_path, pan
 from asysplat.data.procedural.world import World
@@ -26,6 +25,10 @@ PROBE_SIZE = 16  # pixels a side of those images
 MIN_LIGHT = 1e-3  # darker is black
 CONTRAST = 1.1  # standard deviation of the log light along a path, before the S-curve
 BRIGHTNESS = -0.2  # mean of the same
+# A rotated grid: an edge at any angle crosses the four rays one after the other.
+SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+# Offsets (x, y) from a pixel to itself and its neighbors.
+NEIGHBORS = ((0, 0), (0, -1), (-1, 0), (1, 0), (0, 1))
 
 
 def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
@@ -139,3 +142,48 @@ class ProceduralScene:
         levels = levels.clamp(min=MIN_LIGHT).log()
         self._gamma = CONTRAST / levels.std()
         self._threshold = self._gamma * levels.mean() - BRIGHTNESS
+
+
+# Antialiased edges, by several rays a pixel where two surfaces meet. These rays only find which
+# surface they hit; its color is taken from the nearest pixel showing it.
+
+
+def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
+    """Return the flat indices of pixels beside, above or below a pixel of another surface."""
+    edges = torch.zeros_like(surfaces, dtype=torch.bool)
+    beside, above = surfaces[:, 1:] != surfaces[:, :-1], surfaces[1:] != surfaces[:-1]
+    edges[:, 1:] |= beside
+    edges[:, :-1] |= beside
+    edges[1:] |= above
+    edges[:-1] |= above
+    return edges.flatten().nonzero()[:, 0]
+
+
+def sample_directions(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
+    """Return SAMPLES directions around each pixel center's, of z = 1; `pixel` is its width there."""
+    offsets = pixel * torch.tensor(SAMPLES, device=directions.device).T[..., None]
+    x, y, z = directions[:, None].expand(-1, len(SAMPLES), -1)
+    return torch.stack((x + offsets[0], y + offsets[1], z)).flatten(1)
+
+
+def average_samples(
+    colors: Float[Tensor, "3 HW"],
+    surfaces: Int[Tensor, "H W"],
+    pixels: Int[Tensor, " E"],
+    sampled: Int[Tensor, " SE"],
+) -> Float[Tensor, "3 E"]:
+    """Average the colors of the surfaces `sampled` by the rays of `sample_directions`.
+
+    A surface that no neighboring pixel shows is replaced by the pixel's own.
+    """
+    height, width = surfaces.shape
+    x, y = torch.tensor(NEIGHBORS, device=pixels.device).T[..., None]
+    around = ((pixels // width + y).clamp(0, height - 1)) * width
+    around += (pixels % width + x).clamp(0, width - 1)
+    shown = surfaces.flatten()[around]
+    sampled = sampled.view(len(SAMPLES), -1)
+    # The first neighbor that shows the surface has the largest countdown.
+    countdown = torch.arange(len(NEIGHBORS), 0, -1, device=pixels.device)[:, None, None]
+    latest = torch.where(shown[:, None] == sampled, countdown, 0).amax(0)
+    first = (len(NEIGHBORS) - latest) % len(NEIGHBORS)
+    return colors[:, around.gather(0, first)].mean(1)

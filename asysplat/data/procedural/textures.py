@@ -134,10 +134,7 @@ def noise_lattice(rng: Generator) -> Float[np.ndarray, "2 N N"]:
 def fractal_noise(
     lattice: Float[Tensor, "2 N N"], uv: Float[Tensor, "2 R"], footprint: Float[Tensor, " R"]
 ) -> Float[Tensor, "2 R"]:
-    """Sum value noise of amplitude about 1 over the octaves that a pixel can resolve.
-
-    `uv` and the pixel's width are in lattice points of the coarsest octave.
-    """
+    """Sum value noise over the octaves that a pixel can resolve; lengths are the coarsest's."""
     octave = torch.arange(OCTAVES, device=uv.device)
     frequency = 2.0**octave
     # The lattices of the octaves are shifted so that their points do not coincide.

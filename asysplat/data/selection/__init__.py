@@ -76,10 +76,7 @@ def training_selection(
     rng: np.random.Generator,
     targets_may_be_inputs: bool = False,
 ) -> Selection:
-    """Select inputs evenly over a random window, and random targets within it.
-
-    `window`: least and greatest number of images, clipped to the sequence; None: all of them.
-    """
+    """Select inputs evenly over a random window, of least and greatest length, and targets."""
     _check_length(num_images, num_inputs, num_targets)
     shortest, longest = (num_images, num_images) if window is None else window
     if not num_inputs + num_targets <= shortest <= longest:

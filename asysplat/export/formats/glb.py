@@ -62,22 +62,12 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
         views.append(view | {"target": ARRAY_BUFFER})
         size += array.nbytes
     accessors[0] |= {"min": scene.means.amin(0).tolist(), "max": scene.means.amax(0).tolist()}
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "mode": POINTS,
-        "extensions": {EXTENSION: KERNEL},
-    }
-    document = {
-        "asset": {"version": "2.0", "generator": "asysplat"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": size}],
-    }
+    places = {name: index for index, name in enumerate(attributes)}
+    primitive = {"attributes": places, "mode": POINTS, "extensions": {EXTENSION: KERNEL}}
+    document = {"asset": {"version": "2.0", "generator": "asysplat"}, "extensionsUsed": [EXTENSION]}
+    document |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    document |= {"meshes": [{"primitives": [primitive]}], "accessors": accessors}
+    document |= {"bufferViews": views, "buffers": [{"byteLength": size}]}
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = HEADER.size + CHUNK.size + len(text) + CHUNK.size + size

@@ -35,11 +35,9 @@ def read_splat(path: str | Path) -> Gaussians:
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Write one scene, without batch dimension, as a .splat file, which holds no SH above degree 0.
-
-    The most visible Gaussians come first, as viewers show a file while it loads.
-    """
+    """Write one scene, without batch dimension, as a .splat file, without SH above degree 0."""
     scene = prepare_for_export(gaussians)
+    # The most visible first, as viewers show a file while it loads.
     order = (scene.opacities.log() + scene.scales.log().sum(1)).argsort(descending=True)
     scene = scene.map(lambda field: field[order])
     colors = torch.cat((0.5 + SH_C0 * scene.sh[:, 0], scene.opacities[:, None]), 1)
