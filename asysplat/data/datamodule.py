@@ -17,15 +17,9 @@ from rich.markup import escape
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Subset
 
+from asysplat.data import loader
 from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
-from asysplat.data.loader import (
-    BatchSplit,
-    EpochLoader,
-    batches_done,
-    ignore_first_sigterm,
-    split_batch,
-)
 from asysplat.data.normalize import Normalization, depths_of_points, normalize
 from asysplat.data.selection import Selection
 from asysplat.data.sources import Source, Task
@@ -172,9 +166,9 @@ class SceneDataModule(lightning.LightningDataModule):
             with self._naming(name):
                 check(tasks[0]["inputs"].num_views)
 
-    def split(self, processes: int) -> BatchSplit:
+    def split(self, processes: int) -> loader.BatchSplit:
         """Divide the scenes of an optimizer step among processes."""
-        return split_batch(self.batch_size, self.micro_batch, processes)
+        return loader.split_batch(self.batch_size, self.micro_batch, processes)
 
     @property
     def _process(self) -> tuple[int, int]:
@@ -184,7 +178,7 @@ class SceneDataModule(lightning.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         trainer, count = self.trainer, self.steps_per_epoch * self.batch_size
         assert trainer is not None  # it is the caller
-        return self.tasks(trainer.current_epoch * count, count, batches_done(trainer))
+        return self.tasks(trainer.current_epoch * count, count, loader.batches_done(trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
         """Return this process's micro-batches of `count` tasks from `start` on, after `done`.
@@ -195,7 +189,7 @@ class SceneDataModule(lightning.LightningDataModule):
         micro_batch = self.split(processes).micro_batch
         first = start + rank + done * micro_batch * processes
         tasks = Subset(TrainingTasks(self), range(first, start + count, processes))
-        return EpochLoader(
+        return loader.EpochLoader(
             done,
             tasks,
             batch_size=micro_batch,
@@ -205,7 +199,7 @@ class SceneDataModule(lightning.LightningDataModule):
             # The platform's default: inside a joblib job the default is joblib's, which cannot
             # start these workers.
             multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
-            worker_init_fn=ignore_first_sigterm,
+            worker_init_fn=loader.ignore_first_sigterm,
             # Starting a loader draws from its generator, and a resumed run starts one more.
             generator=torch.Generator(),
         )

@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich import progress
 from torch.utils.data import Dataset
 
 from asysplat.data.datamodule import Sample
@@ -50,9 +43,10 @@ def measure_scenes(
     make_folder(scene_folder, "paths.logs")
     make_folder(folder / "figures", "paths.logs")
     main, last = next(iter(tests)), measure.steps[-1]
-    columns = [TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn()]
-    columns += [TimeElapsedColumn(), TimeRemainingColumn()]
-    with Progress(*columns, console=make_console()) as bars:
+    columns = [progress.TextColumn("{task.description:8}"), progress.BarColumn(bar_width=20)]
+    columns += [progress.MofNCompleteColumn(), progress.TimeElapsedColumn()]
+    columns += [progress.TimeRemainingColumn()]
+    with progress.Progress(*columns, console=make_console()) as bars:
         scenes = bars.add_task("scenes", total=sum(map(len, tests.values())))
         steps = bars.add_task("steps", total=last, visible=last > 0)
 

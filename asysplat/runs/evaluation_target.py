@@ -12,16 +12,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
 from asysplat.ranges import Count, Positive, check_options, check_training
+from asysplat.runs import runs
 from asysplat.runs.run_config import plain_options, read_config
-from asysplat.runs.runs import (
-    RESULTS,
-    content_of,
-    describe_run,
-    find_runs,
-    folder_of,
-    hash_of,
-    name_of,
-)
 from asysplat.runs.summary import TESTED
 
 CHECKPOINT = "checkpoints/last.ckpt"
@@ -53,7 +45,7 @@ class EvaluationTarget:
     @property
     def scene_folder(self) -> Path:
         """The folder of the results of single scenes, another for every `fingerprint`."""
-        return self.folder / "evaluation" / hash_of(self.fingerprint)
+        return self.folder / "evaluation" / runs.hash_of(self.fingerprint)
 
 
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
@@ -93,7 +85,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     else:
         stem, made_of = _describe_source(system, options, overrides)
         fingerprint |= describe_system(config, options.system or stem, made_of)
-    folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(fingerprint)[:8]}"
+    folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{runs.hash_of(fingerprint)[:8]}"
     return EvaluationTarget(config, system, folder, fingerprint)
 
 
@@ -128,10 +120,10 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
     """Take a run with its own options; the evaluation is written beside its results."""
 
     def find(logs: Path) -> list[Path]:
-        return [run.folder for run in find_runs(logs)]
+        return [run.folder for run in runs.find_runs(logs)]
 
-    files = (RESULTS, "config.yaml", CHECKPOINT)
-    folder = folder_of(options.run, Path(options.paths.logs), find, files)
+    files = (runs.RESULTS, "config.yaml", CHECKPOINT)
+    folder = runs.folder_of(options.run, Path(options.paths.logs), find, files)
     refuse_links(folder)
     checkpoint = folder / CHECKPOINT
     for override in overrides:
@@ -148,7 +140,7 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
 
 
 def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
-    described = describe_run(config)
+    described = runs.describe_run(config)
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
     described["evaluation/post_optimization_steps"] = str(options.post_optimization_steps)
     return described
@@ -173,7 +165,7 @@ def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any])
     tested = options_of_test(config, config.data.name)
     return {
         SYSTEM: system,
-        "evaluation/made_of": hash_of(made_of),
+        "evaluation/made_of": runs.hash_of(made_of),
         **{f"{TESTED}{key}": value for key, value in tested.items()},
     }
 
@@ -185,7 +177,7 @@ def contents_below(path: Path) -> dict[str, Any]:
         folder, stem = path.parent, glob.escape(path.stem)
     patterns = (f"{stem}.*", f"{stem}/*.*", f"{stem}/*/*/*")  # Gaussians, images, a COLMAP model
     files = [file for pattern in patterns for file in folder.glob(pattern) if file.is_file()]
-    return {str(file.relative_to(folder)): content_of(file) for file in files}
+    return {str(file.relative_to(folder)): runs.content_of(file) for file in files}
 
 
 def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
@@ -198,8 +190,8 @@ def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
     data |= changes
     options = {key: value for key, value in data.items() if key in IMAGES}
     options["data"] = test_set if "root" in changes else data["name"]
-    options["root"] = name_of(data["root"])
-    options["index"] = content_of(data.get("index"))
+    options["root"] = runs.name_of(data["root"])
+    options["index"] = runs.content_of(data.get("index"))
     metrics = plain_options(config.metrics)
     options |= {f"metrics.{key}": value for key, value in metrics.items() if key != "_target_"}
     return {key: value for key, value in options.items() if value not in (None, MISSING)}

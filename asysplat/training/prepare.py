@@ -23,15 +23,7 @@ from torch import nn
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError, brief, input_error_behind
 from asysplat.models.network import EarlyExit
-from asysplat.runs.checkpoints import (
-    check_checkpoint,
-    config_diff,
-    existing_weights,
-    find_checkpoint,
-    has_checkpoints,
-    load_weights,
-    read_metadata,
-)
+from asysplat.runs import checkpoints
 from asysplat.runs.machine import find_accelerator, revision
 from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import RESULTS, describe_run
@@ -72,13 +64,13 @@ class TrainingStage:
 
     def load(self, module: SplattingModule) -> None:
         """Load the weights to start from, and say what is trained."""
-        load_weights(self.weights, module)
+        checkpoints.load_weights(self.weights, module)
         _say(f"{self.config.stage}: {describe_stage(self.config)}")
         _say(f"model: {module.net.describe()}")
         options = plain_options(self.config)
         module.save_hyperparameters(options, logger=False)
-        metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
-        for difference in config_diff(metadata, options, revision()):
+        metadata = {} if self.checkpoint is None else checkpoints.read_metadata(self.checkpoint)
+        for difference in checkpoints.config_diff(metadata, options, revision()):
             _say(f"not as before: {difference}")
 
     def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
@@ -97,7 +89,7 @@ class TrainingStage:
         """Divide the batches between the processes, and write config.yaml, before anything else."""
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
-        resumes = has_checkpoints(self.folder)
+        resumes = checkpoints.has_checkpoints(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if trainer.is_global_zero:
             print(split)
@@ -174,14 +166,15 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         quiet_lightning()
         fingerprint = describe_run(config)  # now, since files may be edited during the training
         runs = Path(config.paths.logs) / config.name
-        checkpoint = find_checkpoint(config.ckpt_path, folder, runs, say=_say)
+        checkpoint = checkpoints.find_checkpoint(config.ckpt_path, folder, runs, say=_say)
         first, results = resume_point(checkpoint, configs)
         weights = config.init_path if checkpoint is None else None
-        file = checkpoint if weights is None else existing_weights(weights)
+        file = checkpoint if weights is None else checkpoints.existing_weights(weights)
         if file is not None:  # fits the model, before any scene is made
             with torch.device("meta"):
                 net = instantiate(configs[first].model)
-            check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+            weights_here = nn.ModuleDict({"net": net})  # named as in a checkpoint
+            checkpoints.check_checkpoint(file, weights_here)
         stages: list[TrainingStage] = []
         for stage in configs[first:]:
             if stage is not config:

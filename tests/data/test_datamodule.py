@@ -58,11 +58,11 @@ class Trainer:
 @pytest.mark.medium
 def test_the_steps_of_several_processes_are_those_of_one(monkeypatch):
     """For any micro-batch: two steps of 4 scenes, in the second epoch; also after the first one."""
-    monkeypatch.setattr(datamodule, "batches_done", lambda trainer: 0)
+    monkeypatch.setattr(datamodule.loader, "batches_done", lambda trainer: 0)
     (alone,) = scenes_of_steps(processes=1, micro_batch=4)
     assert len({name for step in alone for name in step}) == 8
     for processes, micro_batch, done in ((2, 2, 0), (2, 1, 0), (2, 2, 1), (2, 1, 2)):
-        monkeypatch.setattr(datamodule, "batches_done", lambda trainer, done=done: done)
+        monkeypatch.setattr(datamodule.loader, "batches_done", lambda trainer, done=done: done)
         steps = zip(*scenes_of_steps(processes, micro_batch), strict=True)
         together = [sorted(name for share in step for name in share) for step in steps]
         assert together == [sorted(step) for step in alone[done > 0 :]]

@@ -1,4 +1,1 @@
-"""Check a scene's files, and whether its cameras fit its images.
-
-asysplat check PATH
-"""
+"""Check a scene's files, and whether its cameras fit its images: asysplat check PATH."""

@@ -160,7 +160,7 @@ def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
 
 
 def sample_directions(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
-    """Return SAMPLES directions around each pixel center's, of z = 1; `pixel` is its width there."""
+    """Return SAMPLES directions around each pixel center's, z = 1; `pixel` is its width there."""
     offsets = pixel * torch.tensor(SAMPLES, device=directions.device).T[..., None]
     x, y, z = directions[:, None].expand(-1, len(SAMPLES), -1)
     return torch.stack((x + offsets[0], y + offsets[1], z)).flatten(1)

@@ -14,13 +14,7 @@ from jaxtyping import Float, UInt32
 from numpy import ndarray
 from numpy.lib.recfunctions import structured_to_unstructured
 
-from asysplat.export.formats.packing import (
-    TINY,
-    in_morton_order,
-    join_largest,
-    prepare_for_export,
-    split_largest,
-)
+from asysplat.export.formats import packing
 from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
@@ -44,7 +38,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
     Gaussians are ordered along a Z-order curve, so that those of a range are near each other. A
     comment tells whether they are to be rendered `antialiased`.
     """
-    scene = in_morton_order(prepare_for_export(gaussians))
+    scene = packing.in_morton_order(packing.prepare_for_export(gaussians))
     count, chunks = scene.num_gaussians, -(-scene.num_gaussians // CHUNK)
     log_scales = scene.scales.log().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     values = torch.stack((scene.means, log_scales, 0.5 + SH_C0 * scene.sh[:, 0]), 1).numpy()
@@ -55,7 +49,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians, antialiased: bo
     low, extent = ranges[:, None, :, 0], ranges[:, None, :, 1] - ranges[:, None, :, 0]
     places = (filled - low) / np.where(extent > 0, extent, 1)
     position, scale, color = places.reshape(-1, 3, 3)[:count].transpose(1, 0, 2)
-    largest, rest = (part.numpy() for part in split_largest(scene.quats))
+    largest, rest = (part.numpy() for part in packing.split_largest(scene.quats))
     rotation = np.concatenate((largest[:, None] / 3, rest * 0.5**0.5 + 0.5), 1)
     color = np.concatenate((color, scene.opacities[:, None].numpy()), 1)
     places = (position, rotation, scale, color)
@@ -99,9 +93,9 @@ def unpack(elements: dict[str, ndarray]) -> Gaussians:
     largest = (3 * rotation[:, 0]).round().astype(np.int64)
     return Gaussians(
         means=torch.from_numpy(_within(ranges[:, 0], position)).float(),
-        quats=join_largest(largest, (rotation[:, 1:] - 0.5) * 2**0.5).float(),
-        scales=torch.from_numpy(_within(ranges[:, 1], scale)).exp().float().clamp_min(TINY),
-        opacities=torch.from_numpy(color[:, 3]).float().clamp_min(TINY),
+        quats=packing.join_largest(largest, (rotation[:, 1:] - 0.5) * 2**0.5).float(),
+        scales=torch.from_numpy(_within(ranges[:, 1], scale)).exp().float().clamp_min(packing.TINY),
+        opacities=torch.from_numpy(color[:, 3]).float().clamp_min(packing.TINY),
         sh=sh,
     )
 

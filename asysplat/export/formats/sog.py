@@ -19,14 +19,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.formats.packing import (
-    TINY,
-    in_morton_order,
-    join_largest,
-    prepare_for_export,
-    reading,
-    split_largest,
-)
+from asysplat.export.formats import packing
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -51,7 +44,7 @@ def write_sog(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
     fitted to the scene, the other SH the nearest of a palette. Gaussians are ordered along a
     Z-order curve. meta.json tells whether they are to be rendered `antialiased`.
     """
-    scene = in_morton_order(prepare_for_export(gaussians))
+    scene = packing.in_morton_order(packing.prepare_for_export(gaussians))
     count = len(scene.opacities)
     if count > MAX_SIDE**2:
         raise InputError(
@@ -80,8 +73,8 @@ def _quantize(scene: Gaussians) -> tuple[dict[str, dict], dict[str, Int[Tensor, 
     """Compute the records of meta.json and the pixels of the images, of all but shN."""
     logs = scene.means.double().sign() * scene.means.double().abs().log1p()
     low, high = logs.amin(0), logs.amax(0)
-    fixed = (65535 * (logs - low) / (high - low).clamp_min(TINY)).round().int()
-    largest, rest = split_largest(scene.quats)
+    fixed = (65535 * (logs - low) / (high - low).clamp_min(packing.TINY)).round().int()
+    largest, rest = packing.split_largest(scene.quats)
     rest = (255 * (0.5 + rest / math.sqrt(2))).round().int()
     scale_codes, scales = _codebook(scene.scales.double().log())
     color_codes, colors = _codebook(scene.sh[:, 0])
@@ -201,7 +194,7 @@ def _k_means(
 
 def read_sog(path: str | Path) -> Gaussians:
     """Read one scene from a SOG bundle of version 2."""
-    with reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
+    with packing.reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
         meta = _read_meta(archive)
         count = meta["count"]
         (low, high) = (torch.tensor(meta["means"][key]).double() for key in ("mins", "maxs"))
@@ -212,6 +205,7 @@ def read_sog(path: str | Path) -> Gaussians:
         )
         rotations = rotations.numpy()
         largest = rotations[:, 3].astype(np.int64) - FIRST_TAG
+        rest = (rotations[:, :3] / 127.5 - 1) / math.sqrt(2)
         fixed = coarse[:, :3].int() << 8 | fine[:, :3]
         logs = low + (high - low) * fixed / 65535
         sh = [_decode(meta["sh0"], colors[:, None, :3])]
@@ -219,16 +213,16 @@ def read_sog(path: str | Path) -> Gaussians:
             sh.append(_read_palette(archive, meta["shN"], count))
         return Gaussians(
             means=(logs.sign() * logs.abs().expm1()).float(),
-            quats=join_largest(largest, (rotations[:, :3] / 127.5 - 1) / math.sqrt(2)).float(),
-            scales=_decode(meta["scales"], scales[:, :3]).exp().clamp_min(TINY),
-            opacities=(colors[:, 3] / 255).clamp_min(TINY),
+            quats=packing.join_largest(largest, rest).float(),
+            scales=_decode(meta["scales"], scales[:, :3]).exp().clamp_min(packing.TINY),
+            opacities=(colors[:, 3] / 255).clamp_min(packing.TINY),
             sh=torch.cat(sh, 1),
         ).validate()
 
 
 def is_antialiased(path: Path) -> bool:
     """Read whether a file is to be rendered with `antialiased`."""
-    with reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
+    with packing.reading(path, "a SOG bundle") as path, zipfile.ZipFile(path) as archive:
         return _read_meta(archive).get("antialias", False)
 
 

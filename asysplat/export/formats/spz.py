@@ -19,15 +19,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from asysplat.errors import InputError
-from asysplat.export.formats.packing import (
-    TINY,
-    half_turn,
-    in_morton_order,
-    join_largest,
-    prepare_for_export,
-    reading,
-    split_largest,
-)
+from asysplat.export.formats import packing
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -79,7 +71,7 @@ def encode_spz(gaussians: Gaussians, version: int = 3, antialiased: bool = False
     """Return the content of an SPZ file; see `write_spz`."""
     if version not in (2, 3, 4):
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
-    scene = in_morton_order(half_turn(prepare_for_export(gaussians), 0))
+    scene = packing.in_morton_order(packing.half_turn(packing.prepare_for_export(gaussians), 0))
     degree, bits = math.isqrt(scene.sh.shape[1]) - 1, _fraction_bits(scene)
     streams = [stream.tobytes() for stream in _streams(scene, bits, version)]
     header = (MAGIC, version, scene.num_gaussians, degree, bits, ANTIALIASED * antialiased)
@@ -122,7 +114,7 @@ def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UIn
         quats = torch.where(quats[:, 3:] < 0, -quats, quats)
         yield _byte(127.5 * (quats[:, :3] + 1))
     else:
-        index, rest = (part.numpy() for part in split_largest(quats))
+        index, rest = (part.numpy() for part in packing.split_largest(quats))
         sizes = (511 * np.sqrt(2) * np.abs(rest) + 0.5).astype(np.uint32)
         ten_bits = sizes | (rest < 0).astype(np.uint32) << 9
         packed = index.astype(np.uint32)
@@ -137,7 +129,7 @@ def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UIn
 
 def read_spz(path: str | Path) -> Gaussians:
     """Read one scene from SPZ, version 2, 3 or 4; SH of degree 4 are left out."""
-    with reading(path, "SPZ") as path:
+    with packing.reading(path, "SPZ") as path:
         header, streams = _read_streams(path.read_bytes())
         count = header.count
         positions, alphas, colors, scales, rotations, sh = (
@@ -154,15 +146,15 @@ def read_spz(path: str | Path) -> Gaussians:
             means=torch.from_numpy(means).float(),
             quats=_quats(rotations).roll(1, 1).float(),
             scales=torch.from_numpy(np.exp(scales / np.float32(16) - 10)),
-            opacities=torch.from_numpy(alphas[:, 0] / np.float32(255)).clamp_min(TINY),
+            opacities=torch.from_numpy(alphas[:, 0] / np.float32(255)).clamp_min(packing.TINY),
             sh=torch.from_numpy(np.concatenate((color, rest), 1)),
         )
-        return half_turn(gaussians, 0).validate()
+        return packing.half_turn(gaussians, 0).validate()
 
 
 def is_antialiased(path: Path) -> bool:
     """Read whether a file is to be rendered with `antialiased`."""
-    with reading(path, "SPZ") as path, open(path, "rb") as file:
+    with packing.reading(path, "SPZ") as path, open(path, "rb") as file:
         start = file.read(HEADER.size)
         if not start.startswith(MAGIC):
             file.seek(0)
@@ -197,7 +189,7 @@ def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
     packed = np.ascontiguousarray(rotations).view("<u4")
     ten_bits = packed >> np.array([20, 10, 0], np.uint32) & 1023
     rest = (ten_bits & 511) / (511 * np.sqrt(2)) * np.where(ten_bits >> 9, -1, 1)
-    return join_largest((packed[:, 0] >> 30).astype(np.int64), rest)
+    return packing.join_largest((packed[:, 0] >> 30).astype(np.int64), rest)
 
 
 def _header(content: bytes) -> Header:

@@ -50,11 +50,10 @@ PREEMPTION_SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 class Checkpoints(ModelCheckpoint):
     """Writes the best checkpoint and last.ckpt; renames the previous last.ckpt to previous.ckpt.
 
-    `filename` and `monitor` in conf/callbacks/default.yaml name and select the best; it is not
-    written if no callback logs `monitor`. last.ckpt is written after every validation, every
-    `minutes` between validations, and when a scheduler sends one of PREEMPTION_SIGNALS. After that
-    checkpoint the signal's earlier handler runs (submitit's, for example), or the run ends with
-    status 128 + the signal's number.
+    `filename` and `monitor` name and select the best; it is not written if no callback logs
+    `monitor`. last.ckpt is written after every validation, every `minutes` between validations, and
+    at one of PREEMPTION_SIGNALS; then the signal's earlier handler runs (submitit's, for example),
+    or the run ends with status 128 + the signal's number.
 
     Beside Lightning's entries, a checkpoint holds `revision` and each process's `random_states`.
     `minutes` of 0 stand for every step; without them last.ckpt is only written after validations.
