@@ -34,7 +34,7 @@ def input_error_behind(error: BaseException) -> InputError | None:
 
 
 def first_mistake(error: Any, title: str | None = None) -> InputError:
-    """Return the first mistake that pydantic lists, of the option `title` or a dataclass's."""
+    """Return the first mistake of a ValidationError as a sentence; `title` names its option."""
     first = error.errors()[0]
     if "error" in first.get("ctx", {}):  # raised by a dataclass itself
         return InputError(str(first["ctx"]["error"]))

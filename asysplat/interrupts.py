@@ -11,7 +11,7 @@ MIN_SECONDS = 1.0  # between two interrupts
 
 
 def handle_signals() -> None:
-    """Set the signal handlers of a script, after its imports: pycolmap would print a stack trace.
+    """Set the signal handlers of a script; after its imports, as pycolmap sets some of its own.
 
     SIGHUP, of a terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`).
     """

@@ -25,7 +25,7 @@ def print_table(
     box: Box = HEAVY_HEAD,
     first: Collection[int] = (),
 ) -> None:
-    """Print a table; columns that do not fit follow in tables below, beside the first again."""
+    """Print a table; columns that do not fit follow in tables below, each with the first one."""
 
     def part(numbers: Sequence[int]) -> Table:
         table = Table(box=box, title=title if numbers[1] == 1 else None)

@@ -21,7 +21,7 @@ SECONDS = (
 
 
 def mean_but_longest(seconds: Sequence[float]) -> float:
-    """Compute the mean of all but the longest (paper, Suppl. "Inference overhead"), or of one."""
+    """Compute the mean of all but the longest, as the paper's "Inference overhead", or the only one."""
     return statistics.fmean(sorted(seconds)[:-1] or seconds)
 
 
@@ -32,7 +32,7 @@ def wait_for(device: torch.device) -> None:
 
 
 class CostMeter:
-    """Measures seconds and peak memory from each `start` to its `stop`; none may overlap."""
+    """Measures seconds and peak memory from each `start` to its `stop`; meters must not overlap."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -59,7 +59,7 @@ def memory_gb(device: torch.device | str) -> float:
 
 
 def reset_peak_memory(device: torch.device | str) -> bool:
-    """Reset the peak that `peak_memory_gb` reads, if it can be: on CUDA, and mostly on Linux."""
+    """Reset the peak that `peak_memory_gb` reads; return whether this was possible."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         return True

@@ -169,7 +169,7 @@ LABELS = ("set", "scene", "images", "view", "method")
 def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
     """Average every numeric column over the images that have it; NaN is left out.
 
-    Over "scenes", the images of each scene come first.
+    Over "scenes", the images of each scene are averaged first.
     """
     if over == "scenes":
         scenes: dict[str | float, list[ImageRow]] = {}

@@ -13,7 +13,7 @@ MIN_IN_VIEW = 0.5  # fraction of the Gaussians that its cameras see, if they are
 
 
 def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
-    """Read the cameras beside a file of Gaussians; None, with the reason, where none fit it."""
+    """Read the cameras beside a file of Gaussians; None, and a line why, where none fit it."""
     file = scene.with_name(CAMERAS)
     if not file.exists():
         return None

@@ -135,7 +135,7 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
 
 
 def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitted: bool) -> None:
-    """Check that at least half of the views show Gaussians; `fitted`: by the file's cameras."""
+    """Check that at least half of the views show Gaussians, `fitted` by their cameras or not."""
     with torch.no_grad():
         views = cameras.resized(COVERAGE_SIZE, COVERAGE_SIZE)
         alpha = render(gaussians, views, depth=False).alpha
@@ -160,7 +160,7 @@ def world_origin(sequence: ImageSequence) -> tuple[float, float, float]:
 
 
 def _by_stem(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
-    """Return the poses by names without folder and suffix that only one has."""
+    """Return the poses by their files' stems, where these occur once."""
     by_stem = [(PurePosixPath(name).stem, pose) for name, pose in named]
     counts = Counter(stem for stem, _ in by_stem)
     return {stem: pose for stem, pose in by_stem if counts[stem] == 1}

@@ -161,7 +161,7 @@ def _check_new(folder: Path, options: DictConfig) -> None:
 
 
 def describe_system(config: DictConfig, system: str, made_of: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe a system, of scenes `made_of` something, and what it is measured on."""
+    """Describe a system, whose scenes are `made_of` files or options, and what it is tested on."""
     tested = options_of_test(config, config.data.name)
     return {
         SYSTEM: system,

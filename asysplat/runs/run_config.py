@@ -15,7 +15,7 @@ from asysplat.root import CONF
 
 
 def read_config(path: Path) -> DictConfig:
-    """Read the config.yaml of a run; Hydra calls any `_target_`, so only those of conf/ may be."""
+    """Read the config.yaml of a run; Hydra calls any `_target_`, so only those of conf/ pass."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
     except (OSError, yaml.YAMLError, OmegaConfBaseException) as error:

@@ -170,7 +170,7 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 
 def find_reconstructions(logs: Path) -> list[Path]:
-    """Return the folders of the finished reconstructions below `logs` that left a scene."""
+    """Return the finished reconstructions below `logs` that left a scene, oldest first."""
     folders = (path.parent for path in files_below(logs, RESULTS))
     return [folder for folder in folders if (folder / SCENE).exists()]
 
@@ -203,7 +203,7 @@ def folder_of(
 
 
 def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the options of which a run and a configuration have other values, (run, config)."""
+    """Return the options whose values differ between a run and a configuration: (run, config)."""
     before = _options_of(run.folder)
     current = flat_options(hashed_options(config, ()))
     keys = sorted(before.keys() & current.keys(), key=lambda key: (key.count("."), key))

@@ -86,7 +86,7 @@ class TrainingStage:
         }
 
     def begin(self, trainer: lightning.Trainer, data: SceneDataModule) -> None:
-        """Divide the batches between the processes, and write config.yaml, before anything else."""
+        """Divide the batches between the processes, and write the first file: config.yaml."""
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
         resumes = checkpoints.has_checkpoints(self.folder)

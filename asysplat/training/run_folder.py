@@ -23,7 +23,7 @@ MAX_NAME = 120  # characters; file systems allow 255 bytes
 def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     """Choose the folder of a run, for `hydra.run.dir` of conf/train.yaml.
 
-    An interrupted run, of those of one name in `runs`, resumes in its own folder; others get `new`.
+    An interrupted run resumes in its own folder; others get `new`. `runs` has all of one name.
     """
     if ckpt_path == "last":
         try:
@@ -59,7 +59,7 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
 
 @contextmanager
 def unused_removed(folder: Path) -> Generator[None]:
-    """Remove a run's folder if the body fails before the run, but Hydra, has written to it."""
+    """Remove a run's folder if the body fails before anything but Hydra has written to it."""
     try:
         yield
     except BaseException:

@@ -39,7 +39,7 @@ class Mistake:
 
 
 def common_mistakes(names: Sequence[str]) -> list[Mistake]:
-    """List the mistakes without a factor to fit, the most likely first; `names` are the images'."""
+    """List the mistakes without a factor to fit, the likeliest first; `names` are the images'."""
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
     exchange = "exchange them, and check whether the photographs were turned to stand upright"
     exchanged = {

@@ -31,7 +31,7 @@ def map_name(image: ImageFile, scene: Path) -> str:
 
 
 def with_disparities(posed: PosedScene, scene: Path, cache: Path) -> PosedScene:
-    """Add the existing maps in `cache`, or rather in the scene's own folder, to its images."""
+    """Add the existing maps of `cache` to the images; those in the scene's own folder win."""
     maps: dict[str, Path] = {}
     for folder in (map_folder(scene, cache), scene / BESIDE):
         if folder.is_dir():

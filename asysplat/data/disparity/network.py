@@ -16,7 +16,7 @@ SHORT_SIDE = 518  # pixels of the shorter side in the network's training
 
 
 class DepthAnything:
-    """Estimates the disparity of an image, up to a scale and a shift, by transformers' network."""
+    """Estimates an image's disparity, up to scale and shift, with a network of transformers."""
 
     def __init__(self, network: nn.Module, device: torch.device):
         self.network, self.device = network.to(device).eval(), device

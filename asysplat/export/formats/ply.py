@@ -77,7 +77,7 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read one scene from PLY: little-endian, big-endian, ASCII or compressed, in any order."""
+    """Read one scene from PLY of any byte order, ASCII or compressed; properties in any order."""
     with reading(path, "PLY") as path:
         elements = _read_elements(path)
         vertices = elements["vertex"]

@@ -12,7 +12,7 @@ from asysplat.training.parallel import Batch
 
 
 class NonFiniteSteps(Callback):
-    """Drops steps with a NaN or infinite gradient, with their changes, up to `budget` in a row."""
+    """Drops a step with a non-finite gradient and undoes it; ends a run at `budget` in a row."""
 
     def __init__(self, budget: int = 10):
         self.budget = budget
