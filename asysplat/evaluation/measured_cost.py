@@ -21,7 +21,7 @@ SECONDS = (
 
 
 def mean_but_longest(seconds: Sequence[float]) -> float:
-    """Compute the mean of all but the longest, as the paper's "Inference overhead", or the only one."""
+    """Compute the mean of all but the longest, as the paper's "Inference overhead", or of one."""
     return statistics.fmean(sorted(seconds)[:-1] or seconds)
 
 

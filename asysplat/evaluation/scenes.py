@@ -98,7 +98,6 @@ def save_result(path: Path, result: SceneResult) -> None:
 
 
 def image_rows(scenes: Scenes) -> list[ImageRow]:
-    """Return the rows of all images."""
     return [
         {"set": test_set, "scene": result.scene, **row}
         for test_set, results in scenes.items()

@@ -21,6 +21,12 @@ from asysplat.evaluation.metrics import METRICS
 from asysplat.runs.runs import CHOICES
 
 
+def log_numbers(trainer: Trainer, numbers: Mapping[str, float], step: int) -> None:
+    """Log numbers at once, whatever `log_every_n_steps` is."""
+    for logger in trainer.loggers:
+        logger.log_metrics(numbers, step=step)
+
+
 def log_figure(logger: Logger, name: str, figure: Figure, step: int) -> None:
     """Log a figure to TensorBoard or Weights & Biases."""
     if isinstance(logger, TensorBoardLogger):

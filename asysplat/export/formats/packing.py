@@ -37,7 +37,6 @@ def morton_order(means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
 
 
 def in_morton_order(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians along a Z-order curve."""
     order = morton_order(gaussians.means)
     return gaussians.map(lambda field: field[order])
 

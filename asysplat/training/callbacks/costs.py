@@ -11,6 +11,7 @@ from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest, memory_gb
 from asysplat.evaluation.static_cost import count_parameters, static_costs
+from asysplat.training.loggers import log_numbers
 from asysplat.training.module import SplattingModule
 
 
@@ -42,8 +43,7 @@ class Costs(Callback):
 
     def on_train_start(self, trainer: Trainer, module: SplattingModule) -> None:
         if trainer.global_step == 0:  # a resumed run has logged them
-            for logger in trainer.loggers:
-                logger.log_metrics(self.values, step=0)
+            log_numbers(trainer, self.values, 0)
 
     def on_train_batch_start(self, *_: object) -> None:
         self.step.start()
@@ -57,8 +57,7 @@ class Costs(Callback):
             self.values["cost/seconds_per_step"] = seconds
         if self.step.gb:
             self.values["cost/peak_gb"] = max(self.step.gb)
-        for logger in trainer.loggers:
-            logger.log_metrics(self.values, step=trainer.global_step)
+        log_numbers(trainer, self.values, trainer.global_step)
 
     def on_test_start(self, trainer: Trainer, module: SplattingModule) -> None:
         self.tests = [CostMeter(module.device) for _ in trainer.datamodule.tests]

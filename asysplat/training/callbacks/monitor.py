@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from asysplat.evaluation.measured_cost import peak_memory_gb
-from asysplat.training.loggers import log_histogram
+from asysplat.training.loggers import log_histogram, log_numbers
 from asysplat.training.module import SplattingModule
 from asysplat.training.parallel import Batch, Prediction
 
@@ -42,7 +42,7 @@ class TrainingMonitor(Callback):
     ) -> None:
         self.steps += 1
         if (trainer.global_step + 1) % self.every == 0:
-            log(trainer, gradient_norms(module.net), trainer.global_step)
+            log_numbers(trainer, gradient_norms(module.net), trainer.global_step)
 
     def on_train_batch_end(
         self, trainer: Trainer, module: SplattingModule, _: object, batch: Batch, *__: object
@@ -57,7 +57,7 @@ class TrainingMonitor(Callback):
                 "time/seconds_per_step": self.seconds / self.steps,
                 "memory/peak_gb": peak_memory_gb(module.device),
             }
-            log(trainer, values, trainer.global_step - 1)
+            log_numbers(trainer, values, trainer.global_step - 1)
             self.on_train_start()
 
     def on_validation_epoch_start(self, *_: object) -> None:
@@ -81,15 +81,10 @@ class TrainingMonitor(Callback):
             values = torch.cat(samples)
             if not len(values):
                 continue
-            log(trainer, {f"gaussians/{name}_median": values.median().item()}, trainer.global_step)
+            medians = {f"gaussians/{name}_median": values.median().item()}
+            log_numbers(trainer, medians, trainer.global_step)
             for logger in trainer.loggers:
                 log_histogram(logger, f"gaussians/{name}", values, trainer.global_step)
-
-
-def log(trainer: Trainer, numbers: dict[str, float], step: int) -> None:
-    """Log numbers at once, whatever `log_every_n_steps` is."""
-    for logger in trainer.loggers:
-        logger.log_metrics(numbers, step=step)
 
 
 def gradient_norms(net: nn.Module) -> dict[str, float]:
