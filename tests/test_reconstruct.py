@@ -273,8 +273,6 @@ def test_a_scene_is_written_in_the_formats_of_output(command, photographs, tmp_p
     page = (folder / "scene.html").read_text()
     assert str(photographs.parent) not in page  # nothing of the disk goes to who gets the page
     assert find_reconstructions(tmp_path) == [folder]
-    finished(command(photographs, *options, "output=splat"))
-    assert {file.name for file in folder.glob("scene.*")} == {"scene.splat", "scene.safetensors"}
 
 
 @pytest.mark.medium

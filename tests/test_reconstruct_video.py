@@ -71,8 +71,7 @@ def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views
         (
             [f"a/IMG_{view}.jpg" for view in range(5)],
             "IMG_31.jpg",
-            r"IMG_31\.jpg is the name of none of the 5 photographs used \(views=\): name one of "
-            r"them, such as IMG_3\.jpg, IMG_1\.jpg, IMG_4\.jpg\.",
+            r"none of the 5 photographs used .* name one of them, such as IMG_3\.jpg, IMG_1",
         ),
         (
             ["a/left/1.jpg", "a/right/1.jpg", "a/left/2.jpg"],

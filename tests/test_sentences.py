@@ -175,7 +175,7 @@ def test_only_training_and_evaluation_import_lightning(repository):
     assert result.stdout == "[]\n", result.stderr
 
 
-def test_help_begins_with_lines_that_work(repository, scene, tmp_path):
+def test_help_begins_with_lines_that_work(scene, tmp_path):
     _, lines = asysplat.__doc__.split("\n\n")
     lines = lines.replace("my_scene", str(scene)).replace("scene.ply", str(tmp_path / "scene.ply"))
     lines = lines.replace("128", "64").replace("views=8", "views=2").replace("10.0", "0.1")

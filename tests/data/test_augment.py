@@ -75,16 +75,6 @@ def test_orders_of_inputs_follow_their_probabilities():
     assert Augmentation(reverse=1.0).order(inputs, rng) == inputs[::-1]
 
 
-def test_fractions_of_crops_fill_their_range_and_follow_the_seed():
-    crops = Augmentation(crop=0.77)
-    rng = np.random.default_rng(0)
-    fractions = [crops.draw_crop(rng) for _ in range(200)]
-    assert 0.77 <= min(fractions) < 0.78 and 0.99 < max(fractions) <= 1
-    again = np.random.default_rng(0)
-    assert [crops.draw_crop(again) for _ in range(200)] == fractions
-    assert Augmentation().draw_crop(rng) == 1
-
-
 def test_a_task_has_one_exposure():
     views = make_views()
     # Dark enough that nothing is clipped.

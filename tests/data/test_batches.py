@@ -10,7 +10,6 @@ from asysplat.errors import InputError
     ("given", "expected"),
     [
         ((256, 8, 8), "global batch 256 = 8 processes x 8 scenes x 4 accumulated"),
-        ((24, 8, 2), "global batch 24 = 2 processes x 6 scenes x 2 accumulated"),
         ((2, None, 1), "global batch 2 = 1 process x 2 scenes x 1 accumulated"),
         ((7, 3, 1), "global batch 7 = 1 process x 1 scene x 7 accumulated"),
     ],

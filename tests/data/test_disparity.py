@@ -101,17 +101,6 @@ def test_maps_are_inside_the_data_only_with_beside(command, scene, tmp_path):
     assert read.disparities.max() == LEVELS
 
 
-def test_damaged_images_get_no_map(command, scene, tmp_path):
-    image = sorted((scene / "images").iterdir())[4]
-    data = image.read_bytes()
-    image.write_bytes(data[:300] + bytes(200) + data[500:])
-    code, _, said = command(scene)
-    assert code == 2 and "1 of 12 images cannot be used" in said and image.name in said
-    assert len(list(map_folder(scene, tmp_path / "maps").iterdir())) == FRAMES - 1
-    with pytest.warns(UserWarning, match="left out 1 of 12"):
-        assert command(scene, "--on-error", "skip")[0] == 0
-
-
 def test_a_map_of_another_image_is_refused(command, scene, tmp_path):
     command(scene)
     sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps"))

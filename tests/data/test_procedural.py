@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.sequence import ImageSequence
 from asysplat.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,14 +40,6 @@ def test_validation_and_test_scenes_never_change(split, index):
     found = [*views.images.mean((0, 2, 3)), (1 / views.depths).mean()]
     # Bits depend on the processor; one pixel of another object makes 1e-3 at most.
     assert found == pytest.approx(EVALUATION_SCENES[split, index], abs=1e-3)
-
-
-def test_procedural_scenes_are_image_sequences():
-    short = ProceduralScene(3, 8, 8, num_images=10)
-    assert isinstance(short, ImageSequence)
-    assert (short.name, short.num_images, short.cameras.num_views) == ("procedural-3", 10, 10)
-    views = short.views([7, 2]).validate()
-    assert torch.equal(views.cameras.cam_to_world, short.cameras.cam_to_world[[7, 2]])
 
 
 @pytest.mark.medium

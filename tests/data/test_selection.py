@@ -263,15 +263,6 @@ def test_long_lrm_s_published_file_is_read(tmp_path):
         read_index(file, 3)
 
 
-def test_an_index_is_written_once(tmp_path):
-    file = tmp_path / "index.json"
-    selected = kmeans_selection(line(), 4, 4, "test")
-    write_index(file, {"walk": selected})
-    assert select_from_index(read_index(file, 4), file, "walk", 100, 4) == selected
-    with pytest.raises(InputError, match=r"index\.json exists"):
-        write_index(file, {})
-
-
 def test_an_unusable_index_is_named(tmp_path):
     (tmp_path / "index.json").write_text('{"a": {"context": [1, 1], "target": [2]}}')
     with pytest.raises(InputError, match=r"index\.json.*different image numbers"):
@@ -285,6 +276,8 @@ def test_the_command_writes_an_index_outside_of_the_data_set(folder, tmp_path, c
     assert "2 scenes" in capsys.readouterr().out
     expected = kmeans_selection(ProceduralScene(4, 8, 8, num_images=24).cameras, 4, 8, "test")
     assert select_from_index(read_index(file, 4), file, "s4", 24, 4) == expected
+    with pytest.raises(InputError, match=r"index\.json exists"):
+        write_index(file, {})
     with pytest.raises(SystemExit, match="lies in the data set"):
         index_command([scenes, f"{scenes}/index.json", "--inputs", "4"])
     assert sorted(path.name for path in (tmp_path / "scenes").iterdir()) == ["s3", "s4"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from asysplat import Cameras, Views
-from asysplat.evaluation.figures import comparison_figure, learning_curve
+from asysplat.evaluation.figures import comparison_figure
 from asysplat.rendering import Rendering
 
 
@@ -42,11 +42,3 @@ def test_masked_pixels_are_blank_and_not_in_the_color_range():
         assert row[4].images[0].get_clim() == row[5].images[0].get_clim() == (0, 0.5)
     nothing = replace(views, masks=torch.zeros_like(masks))
     comparison_figure(nothing, nothing, rendering).canvas.draw()
-
-
-def test_the_learning_curve_has_every_validation():
-    rows = [
-        {"step": s, "minutes": s / 10, "psnr": 15 + s, "nearest_view/psnr": 16} for s in range(3)
-    ]
-    figure = learning_curve([row | {"mean_color/psnr": 12} for row in rows])
-    assert list(figure.axes[0].lines[0].get_ydata()) == [15, 16, 17]

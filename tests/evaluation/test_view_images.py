@@ -79,16 +79,3 @@ def test_folders_that_do_not_fit_the_data(task, rendered, case):
     damage(rendered / "room")
     with pytest.raises(InputError, match=re.escape(message)):
         read_images(find_images(rendered, [task])["room"], *SIZE)
-
-
-def test_photographs_of_one_name_cannot_be_told_apart(tmp_path):
-    folder = tmp_path / "room"
-    write_transforms(ProceduralScene(3, *SIZE, num_images=3).views(range(3)), folder)
-    (folder / "images" / "other").mkdir()
-    (folder / "images" / "00001.png").rename(folder / "images" / "other" / "00000.png")
-    text = (folder / "transforms.json").read_text()
-    text = text.replace("images/00001.png", "images/other/00000.png")
-    (folder / "transforms.json").write_text(text)
-    task = Task(open_scene(folder, SceneOptions(*SIZE)), Selection([1], [0, 2]))
-    with pytest.raises(InputError, match="room has several photographs named 00000"):
-        view_names(task)

@@ -1,7 +1,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from paper.cells import make_section
@@ -12,7 +11,6 @@ from paper.compare import (
     paired_difference,
     pooled_std,
     rank_agreement,
-    spearman,
 )
 from paper.grid import Cell
 from paper.tables import Claim, Column, PaperRow, PaperTable
@@ -37,11 +35,6 @@ def test_pooled_std_weighs_by_degrees_of_freedom():
     # Squares within: 2 of 1 degree, 2 of 2 degrees, none of a single seed.
     assert pooled_std([[0.0, 2.0], [4.0, 5.0, 6.0], [9.0]]) == pytest.approx(math.sqrt(4 / 3))
     assert pooled_std([[1.0], [2.0]]) is None
-
-
-def test_spearman_of_two_rows_or_of_equal_rows_is_none():
-    assert spearman(np.array([1.0, 2.0]), np.array([1.0, 2.0])) is None
-    assert spearman(np.array([1.0, 2.0, 3.0]), np.array([5.0, 5.0, 5.0])) is None
 
 
 def test_rank_agreement_takes_the_rows_that_have_both():

@@ -145,7 +145,6 @@ def test_training_on_a_real_scene_leaves_its_files(train, shared, name):
 
 REFUSED = {
     "one of a sweep": (["-m", "seed=-1,x"], "seed=x should be a valid integer."),
-    "an unknown setting of a protocol": (["metrics.depth_alignment=mean"], "'none' or 'median'"),
     "a trainer that cannot be": (["trainer.precision=bf17"], "error: trainer: Precision 'bf17' is"),
     "images too small to measure": (
         ["data.height=4", "data.width=4", "model.patch_coarse=4", "model.patch_fine=2"],
@@ -154,14 +153,11 @@ REFUSED = {
 }
 
 
-ALONE = "an unknown setting of a protocol"  # which the tests' type checks refuse
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_mistake_is_one_sentence_and_status_1(train, case, tmp_path):
     overrides, message = REFUSED[case]
-    result = (train.alone if case == ALONE else train)(*overrides)
+    result = train(*overrides)
     assert result.returncode == 1
     assert message in result.stderr
     assert "Traceback" not in result.stderr

@@ -1,7 +1,6 @@
 """Cameras that are found for photographs of a synthetic scene are those that rendered them."""
 
 import json
-import re
 
 import numpy as np
 import pycolmap
@@ -198,12 +197,10 @@ def test_too_few_photographs(views, tmp_path):
 @pytest.mark.medium
 def test_photographs_that_share_nothing(tmp_path):
     for index in range(4):
-        save(torch.zeros(3, 60, 80), tmp_path / "black" / f"{index}.png")
         noise = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(index))
         save(noise, tmp_path / "noise" / f"{index}.png")
-    for name in ("black", "noise"):
-        sentence = refused(tmp_path / name, tmp_path)
-        assert re.search("found cameras for 0 of 4 photographs: too few show the same", sentence)
+    sentence = refused(tmp_path / "noise", tmp_path)
+    assert "found cameras for 0 of 4 photographs: too few show the same" in sentence
 
 
 @pytest.mark.medium

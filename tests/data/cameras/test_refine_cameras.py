@@ -126,7 +126,7 @@ def test_photographs_without_features_keep_their_cameras(views, tmp_path):
 
 
 @pytest.mark.medium
-def test_a_photograph_that_sees_few_points_keeps_its_pose(views, folder, tmp_path):
+def test_a_photograph_that_sees_few_points_keeps_its_pose(views, tmp_path):
     write_transforms(views, tmp_path / "scene")
     last = tmp_path / "scene" / "images" / f"{COUNT - 1:05d}.png"
     scene = read(tmp_path / "scene")

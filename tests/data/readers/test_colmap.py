@@ -154,7 +154,7 @@ def test_intrinsics_are_scaled_to_smaller_images(scene):
     assert lens == Lens(32, 24, 120 * x, 124 * y, 60 * x, 44 * y, "OPENCV", (0.1, 0.0, 0.0, 0.0))
 
 
-def test_images_of_the_full_size_are_preferred(scene, views):
+def test_images_of_the_full_size_are_preferred(scene):
     shutil.copytree(scene / "images", scene / "images_2")
     assert read(scene).images[0].file == scene / "images/0.png"
     for name in ("0.png", "1.png"):

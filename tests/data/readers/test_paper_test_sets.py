@@ -4,7 +4,7 @@ import json
 
 import pytest
 from hydra.utils import instantiate
-from layouts import colmap, dl3dv, realestate10k, replica, scannetpp
+from layouts import colmap, dl3dv, realestate10k, replica
 
 from asysplat.errors import InputError
 
@@ -20,11 +20,10 @@ def published(views, tmp_path_factory):
         dl3dv.write_scene(views, root / "DL3DV" / "1K" / (letter * 64))
     dl3dv.write_benchmark(views, root / "Benchmark")
     replica.write(views, root / "Replica")
-    scannetpp.write(views, root / "scannetpp")
     realestate10k.write(views, root / "re10k")
     index = {realestate10k.KEY: {"context": [1, 9], "target": [3, 5, 7]}}
     (root / "index.json").write_text(json.dumps(index))
-    places = {"replica": "Replica", "scannetpp": "scannetpp", "realestate10k": "re10k"}
+    places = {"replica": "Replica", "realestate10k": "re10k"}
     places["realestate10k_index"] = "index.json"
     for name in ("tanks_and_temples", "mipnerf360", "deep_blending"):
         colmap.write(views, root / name / "place")
