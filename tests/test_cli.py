@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from asysplat.cli import check_command, error_message
-from asysplat.errors import InputError
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
 FULL_AS_CAUSE = RuntimeError("write")
@@ -16,7 +15,6 @@ FULL_AS_CAUSE.__cause__ = FULL
 LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
 LOST_PEER = RuntimeError("[/gloo/transport/tcp/pair.cc:545] Read error: Connection reset by peer.")
 SENTENCES = {
-    "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
     "a full disk behind": (FULL_AS_CAUSE, "no space on the disk"),
     "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no space on the disk (Disk quota"),
     "a full GPU": (

@@ -37,7 +37,6 @@ def test_known_overrides_are_taken_in_any_folder(known, tmp_path, monkeypatch):
 UNKNOWN = {
     "widht=0.5": "Could not override 'widht': did you mean width?",
     "data.inptus=4": "Could not override 'data.inptus': did you mean data.inputs?",
-    "weight_decay=0": "did you mean training.optimizer.weight_decay?",
     "stage=stage1,stage4": "stage=stage4 is unknown: choose from stage1, stage2, stage3, ablation.",
     "~callbacks.cots": "'callbacks.cots' does not exist: did you mean callbacks.costs?",
     "model=longlrm,asysplat_4m4z": "Could not find 'model/asysplat_4m4z': did you mean model/",

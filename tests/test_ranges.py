@@ -13,7 +13,6 @@ REFUSED = {
     f"seed={2**32}": "seed=4294967296 should be less than 4294967296.",
     "learning_rate=nan": "learning_rate=nan should be",
     "data.window=[12]": "data.window=[12]: List should have at least 2 items",
-    "data.test_size=[0,64]": "data.test_size.0=0 should be greater than or equal to 1.",
     "geometry_ratio=1.5": "geometry_ratio=1.5 should be less than 1.",
 }
 
