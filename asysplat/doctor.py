@@ -46,14 +46,11 @@ def main() -> None:
 def describe() -> dict[str, str]:
     """Describe the project's copy, Python, torch, the processor, the memory and the GPUs."""
     cache, home = Path.home() / ".cache" / "asysplat", shutil.disk_usage(Path.home())
-    info = Path("/proc/cpuinfo")  # Linux alone
-    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
-    processor = model[1] if model else platform.processor() or platform.machine()
     lines = {
         "asysplat": f"{__version__}, {revision()}, in {ROOT}",
         "python": f"{platform.python_version()}, {sys.executable}",
         "system": platform.platform(),
-        "processor": f"{processor}, {os.cpu_count()} cores",
+        "processor": f"{processor()}, {os.cpu_count()} cores",
         "disk": f"{home.free / 1e9:.0f} GB free at home; compiled kernels are in {cache}",
     }
     if find_spec("torch") is None:
@@ -75,6 +72,13 @@ def describe() -> dict[str, str]:
             f"{card.major}.{card.minor}, CUDA {torch.version.cuda}"
         )
     return lines
+
+
+def processor() -> str:
+    """Return the processor's name."""
+    info = Path("/proc/cpuinfo")  # Linux alone
+    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
+    return model[1] if model else platform.processor() or platform.machine()
 
 
 def requirements(extra: str = "") -> set[Requirement]:

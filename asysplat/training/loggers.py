@@ -21,7 +21,7 @@ from asysplat.evaluation.metrics import METRICS
 from asysplat.runs.runs import CHOICES
 
 
-def log_numbers(trainer: Trainer, numbers: Mapping[str, float], step: int) -> None:
+def log_numbers(trainer: Trainer, numbers: Mapping[str, float | int], step: int) -> None:
     """Log numbers at once, whatever `log_every_n_steps` is."""
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=step)
