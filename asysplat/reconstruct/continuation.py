@@ -29,6 +29,9 @@ def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     taken = {key: stored[key] for key in OF_PHOTOGRAPHS if key in stored}
     if not isinstance(taken.get("path"), str):
         raise InputError(f"{file} has no path of photographs: name the folder of a reconstruction.")
+    for key, value in taken.items():
+        if not isinstance(value, str | int | None):
+            raise InputError(f"{file}: {key} is {value}: expected a word or a whole number.")
     taken |= {"run": str(folder), "init": str(folder / SCENE)}
     taken |= {"refinement.half_resolution_until": 0.0}
     kept = {*options, *(OF_QUALITY if "quality" in options else ())} - {"run"}
