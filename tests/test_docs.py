@@ -8,6 +8,8 @@ import sys
 import pytest
 
 import asysplat
+from asysplat.data import ProceduralScene
+from asysplat.data.write import write_transforms
 
 PAGES = ("api", "architecture", "benchmarks", "options", "questions", "scaling", "tables")
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "examples/README.md", "data/README.md"]
@@ -48,6 +50,19 @@ def test_the_architecture_figure_is_up_to_date(repository):
     assert (repository / "docs" / "architecture.svg").read_text() == drawn, (
         "run python docs/architecture.py"
     )
+
+
+@pytest.mark.medium
+def test_photographs_reach_the_scene_by_a_short_way(repository, tmp_path):
+    scene = ProceduralScene(seed=7, height=32, width=32, num_images=10)
+    write_transforms(scene.views(range(10)), tmp_path / "scene")
+    options = ["steps=4", "video.path=none", f"paths.run={tmp_path / 'run'}"]
+    command = [sys.executable, repository / "docs" / "walk.py", "reconstruct"]
+    done = subprocess.run([*command, tmp_path / "scene", *options], capture_output=True, text=True)
+    lines = [line.split() for line in done.stdout.splitlines()]
+    entered = {words[1]: int(words[0]) for words in lines if words[:1] and words[0].isdigit()}
+    assert entered["scene.py"] == 1, done.stderr
+    assert entered["export/formats/ply.py"] <= 18, done.stdout
 
 
 @pytest.mark.slow

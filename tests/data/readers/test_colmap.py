@@ -252,3 +252,21 @@ def test_points_with_other_numbers_than_in_the_images_are_read_without_their_tra
         posed = read(scene)
         assert len(posed.points) == len(points)
     np.testing.assert_allclose(cameras_of(posed), expected, atol=1e-12)
+
+
+def test_quaternions_need_not_be_of_unit_length(scene):
+    expected = cameras_of(read(scene))
+    file = scene / "sparse/0/images.txt"
+    lines = file.read_text().split("\n")
+    first = next(n for n, line in enumerate(lines) if line and not line.startswith("#"))
+    for number in range(first, len(lines), 2):
+        fields = lines[number].split()
+        fields[1:5] = (repr(1.04 * float(value)) for value in fields[1:5])
+        lines[number] = " ".join(fields)
+    file.write_text("\n".join(lines))
+    for change in (lambda folder: folder, lambda folder: as_binary(folder, old=True)):
+        poses = cameras_of(read(change(scene)))
+        np.testing.assert_allclose(poses, expected, atol=1e-12)
+        rotations = poses[:, :3, :3]
+        identity = np.broadcast_to(np.eye(3), rotations.shape)
+        np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
