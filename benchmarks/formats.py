@@ -13,12 +13,12 @@ from asysplat.errors import InputError
 from asysplat.export.gaussians import (
     READERS,
     WRITERS,
+    cameras_beside,
     read_gaussians,
     read_notes,
     write_gaussians,
 )
 from asysplat.export.importance import COMPARED_VIEWS, picture_psnr
-from asysplat.export.scene_cameras import cameras_beside
 from asysplat.scene import Gaussians
 from benchmarks.compare import DECIBELS, RATIO, TIME, TrackedMetrics
 from benchmarks.options import CPU

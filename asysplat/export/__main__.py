@@ -31,6 +31,8 @@ from asysplat.errors import InputError
 from asysplat.export.gaussians import (
     READERS,
     WRITERS,
+    cameras_beside,
+    names_beside,
     read_gaussians,
     read_notes,
     suffix_of,
@@ -38,7 +40,6 @@ from asysplat.export.gaussians import (
 )
 from asysplat.export.importance import most_important, picture_psnr
 from asysplat.export.page import BLACK, PAGE, write_page
-from asysplat.export.scene_cameras import cameras_beside, names_beside
 from asysplat.interrupts import handle_signals
 
 

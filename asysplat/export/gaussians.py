@@ -1,4 +1,4 @@
-"""Read and write Gaussians in the format of the file's suffix."""
+"""Read and write Gaussians in the format of the file's suffix, and the cameras beside it."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 
+from asysplat.data.readers.transforms import read_cameras, read_poses
 from asysplat.errors import InputError
 from asysplat.export.formats import sog, spz
 from asysplat.export.formats.compressed_ply import write_compressed_ply
@@ -18,8 +19,7 @@ from asysplat.export.formats.sog import read_sog, write_sog
 from asysplat.export.formats.splat import read_splat, write_splat
 from asysplat.export.formats.spz import read_spz, write_spz
 from asysplat.export.page import BLACK, PAGE, write_page
-from asysplat.export.scene_cameras import camera_before
-from asysplat.scene import Gaussians
+from asysplat.scene import Cameras, Gaussians
 
 
 class Notes(NamedTuple):
@@ -161,3 +161,41 @@ def suffix_of(path: str | Path, suffixes: Collection[str], verb: str) -> str:
     raise InputError(
         f"{path} cannot be {verb}: its suffix is {found}, expected {', '.join(others)} or {last}."
     )
+
+
+CAMERAS = "transforms.json"  # beside a file of Gaussians
+MIN_IN_VIEW = 0.5  # fraction of the Gaussians that its cameras see, if they are the scene's
+
+
+def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
+    """Read the cameras beside a file of Gaussians; None, and a line why, where none fit it."""
+    file = scene.with_name(CAMERAS)
+    if not file.exists():
+        return None
+    try:
+        cameras = read_cameras(file)
+    except (InputError, OSError) as error:
+        print(f"without cameras: {error}")
+        return None
+    seen = torch.zeros(gaussians.num_gaussians, dtype=torch.bool)
+    for view in range(cameras.num_views):
+        seen |= cameras.select([view]).project(gaussians.means)[2][0]
+    if (visible := seen.float().mean().item()) < MIN_IN_VIEW:
+        print(f"without cameras: those of {file} have {visible:.0%} of the Gaussians in view.")
+        return None
+    return cameras
+
+
+def names_beside(scene: Path) -> list[str]:
+    """Return the photographs' names of the cameras beside a file of Gaussians."""
+    return [Path(name).name for name, _ in read_poses(scene.with_name(CAMERAS))]
+
+
+def camera_before(gaussians: Gaussians) -> Cameras:
+    """Make a camera that has most Gaussians in view, with y down as COLMAP's worlds often have."""
+    center = gaussians.means.median(0).values
+    radius = (gaussians.means - center).norm(dim=-1).median()
+    pose = torch.eye(4)
+    pose[:3, 3] = center - torch.tensor([0.0, 0.0, 3.0]) * radius
+    intrinsics = torch.tensor([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    return Cameras(intrinsics[None], pose[None], 1, 1)

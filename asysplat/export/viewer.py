@@ -34,8 +34,7 @@ from asysplat.data.normalize import normalize
 from asysplat.data.photographs import open_photographs
 from asysplat.errors import InputError
 from asysplat.export import viewer_cameras
-from asysplat.export.gaussians import read_gaussians, read_notes
-from asysplat.export.scene_cameras import camera_before, cameras_beside
+from asysplat.export.gaussians import camera_before, cameras_beside, read_gaussians, read_notes
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views, inverse_depths

@@ -21,9 +21,8 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS, average, write_csv
 from asysplat.export import write_gaussians, write_page, write_video
-from asysplat.export.gaussians import NO_NOTES, WRITERS, Notes
+from asysplat.export.gaussians import CAMERAS, NO_NOTES, WRITERS, Notes
 from asysplat.export.page import PAGE
-from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement import AnchorScene, RefinementProgress

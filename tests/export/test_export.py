@@ -10,9 +10,8 @@ from asysplat import read_gaussians, render, write_gaussians
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.export.__main__ import export
-from asysplat.export.gaussians import Notes
+from asysplat.export.gaussians import CAMERAS, Notes
 from asysplat.export.importance import blending_weights, most_important
-from asysplat.export.scene_cameras import CAMERAS
 from asysplat.geometry.spherical_harmonics import SH_C0
 
 
