@@ -11,6 +11,7 @@ from rich import progress
 from torch.utils.data import Dataset
 
 from asysplat.data.datamodule import Sample
+from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.metrics import ImageRow, average
@@ -78,7 +79,7 @@ def measure_scenes(
             for index in range(len(samples)):
                 path = scene_folder / f"{name}-{index}.json"
                 if path.exists():
-                    result = SceneResult(**read_json(path))
+                    result = read_result(path)
                     stored += 1
                 else:
                     result = measure_scene(name, index)
@@ -89,6 +90,14 @@ def measure_scenes(
             message = f"measured before, as {scene_folder} has them: {stored} scenes"
             bars.console.print(message, soft_wrap=True, highlight=False)
     return results
+
+
+def read_result(path: Path) -> SceneResult:
+    """Read what `save_result` wrote."""
+    try:
+        return SceneResult(**read_json(path))
+    except TypeError as error:
+        raise InputError(f"{path} is not the result of a scene: remove it.") from error
 
 
 def save_result(path: Path, result: SceneResult) -> None:
