@@ -69,7 +69,7 @@ def reconstruct(config: DictConfig) -> None:
     device = find_device(config.device)
     results = Results(Path(config.paths.run), config, per_view)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_error")
-    options = {name: config[name] for name in names}
+    options = {name: config[name] for name in (*names, "masks", "background")}
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
@@ -78,7 +78,7 @@ def reconstruct(config: DictConfig) -> None:
     print(describe(config, photographs, limit))
     photographs = photographs.to(device)
     gaussians = initialize(config, photographs, settings)
-    background = photographs.inputs.mean_color()
+    background = photographs.background
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(Viewer(photographs.inputs) if config.view else None) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}
@@ -91,7 +91,8 @@ def reconstruct(config: DictConfig) -> None:
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
-        if config.last_fit and photographs.held_out is not None and not display.stopped:
+        fits_all = photographs.held_out is not None and not photographs.is_split
+        if config.last_fit and fits_all and not display.stopped:
             gaussians = fit_to_all(gaussians, photographs, settings, config.last_fit, options)
             results.save_scene(gaussians)
         results.save_video(gaussians)

@@ -19,7 +19,7 @@ from asysplat.errors import InputError
 ORTHONORMAL_TOLERANCE = 1e-3
 TINY = 1e-6  # depths and inverse depths above which nothing underflows
 MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
-MAPS = ("depths", "masks", "point_depths", "disparities")  # optional fields of `Views`
+MAPS = ("depths", "masks", "alphas", "point_depths", "disparities")  # optional fields of `Views`
 
 Record = TypeVar("Record", bound="TensorRecord")
 
@@ -221,6 +221,8 @@ class Views(TensorRecord):
         images: [..., V, 3, H, W] RGB in [0, 1].
         depths: [..., V, H, W] along the camera's z axis, in scene units; 0 if unknown.
         masks: [..., V, H, W], True where a pixel counts.
+        alphas: [..., V, H, W] opacity of the photographed object in [0, 1]: 0 where a pixel shows
+            the background alone.
         point_depths: [..., V, H, W] depths of the scene's sparse points; 0 in pixels without one.
         disparities: [..., V, H, W] estimated inverse depths, up to a scale and a shift of each
             view; 0 if unknown.
@@ -239,6 +241,7 @@ class Views(TensorRecord):
     images: Float[Tensor, "*batch V 3 H W"]
     depths: Float[Tensor, "*batch V H W"] | None = None
     masks: Bool[Tensor, "*batch V H W"] | None = None
+    alphas: Float[Tensor, "*batch V H W"] | None = None
     point_depths: Float[Tensor, "*batch V H W"] | None = None
     disparities: Float[Tensor, "*batch V H W"] | None = None
 
@@ -270,8 +273,8 @@ class Views(TensorRecord):
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.
 
-        Images are means over areas. A pixel is masked in only where all pixels it covers are; a
-        depth or disparity is that of the nearest pixel, a point's that of the nearest point.
+        Images and alphas are means over areas. A pixel is masked in only where all pixels it covers
+        are; a depth or disparity is that of the nearest pixel, a point's that of the nearest point.
         """
         size = (height, width)
         area, nearest = (
@@ -284,6 +287,7 @@ class Views(TensorRecord):
 
         methods: dict[str, Callable[[Tensor], Tensor]] = {
             "images": area,
+            "alphas": area,
             "masks": lambda masks: whole_pixels(masks, size),
             "depths": nearest,
             "disparities": nearest,
@@ -311,6 +315,24 @@ class Views(TensorRecord):
         if self.masks is None:
             return rendered
         return torch.where(self.masks[..., None, :, :], rendered, self.images)
+
+    def over(self, before: Tensor, color: Tensor) -> "Views":
+        """Change the color, RGB, that transparent pixels show; opaque ones stay."""
+        if self.alphas is None:
+            return self
+        change = (1 - self.alphas)[..., None, :, :] * (color - before)[:, None, None]
+        return replace(self, images=(self.images + change).clamp(0, 1))
+
+    def surfaces(self, size: tuple[int, int]) -> Bool[Tensor, "*batch V h w"] | None:
+        """Return where pixels of another size show a surface; None: everywhere.
+
+        All that such a pixel covers is masked in, and most of it is no background.
+        """
+        shown = None if self.masks is None else whole_pixels(self.masks, size)
+        if self.alphas is None:
+            return shown
+        opaque = F.interpolate(self.alphas, size, mode="area") > 0.5
+        return opaque if shown is None else shown & opaque
 
     def validate(self, name: str = "Views") -> "Views":
         """Return self if all numbers are usable.

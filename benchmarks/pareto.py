@@ -283,7 +283,8 @@ def _open_procedural_scene(name: str, side: int, inputs: int, targets: int) -> P
     frames = uniform_selection(FRAMES, inputs, targets)
     views = [_without_depths(scene.views(chosen)) for chosen in (frames.inputs, frames.targets)]
     normalization = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
-    return Photographs(name, *views, [], [], normalization, None)
+    background = views[0].mean_color()
+    return Photographs(name, *views, [], [], normalization, None, background)
 
 
 def _open_real_scene(path: Path, side: int, inputs: int, targets: int) -> Photographs:

@@ -35,11 +35,14 @@ def video(views, make_scene):
     files = [[f"scene/images/IMG_{view:02}.jpg" for view in part] for part in parts]
     frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
     scene, _ = make_scene(dtype=torch.float32)
-    photographs = Photographs("scene", *map(views.select, parts), *files, frame, None)
+    photographs = Photographs(
+        "scene", *map(views.select, parts), *files, frame, None, torch.zeros(3)
+    )
 
-    def cameras(**options):
+    def cameras(alphas=None, **options):
+        shown = replace(photographs, inputs=replace(photographs.inputs, alphas=alphas))
         options = {"path": "own", "height": None, "seconds": 1, "fps": 12} | options
-        return video_cameras(OmegaConf.create(options), photographs, scene)
+        return video_cameras(OmegaConf.create(options), shown, scene)
 
     return cameras
 
@@ -53,6 +56,13 @@ def test_a_video_of_another_height_has_the_field_of_view_and_even_sides(video, p
         scale = torch.tensor([size[1] / 48, size[0] / 48, 1.0])[:, None]
         torch.testing.assert_close(made.intrinsics, scale * small.intrinsics)
         assert torch.equal(made.cam_to_world, small.cam_to_world)
+
+
+def test_an_orbit_goes_around_an_object(video, make_scene):
+    middle = make_scene(dtype=torch.float32)[0].means.median(0).values
+    path = video(alphas=torch.ones(14, 48, 48), path="orbit")
+    pixels, depths, _ = path.project(middle[None])
+    assert (depths > 0).all() and (pixels - 24).abs().max() < 1e-3
 
 
 def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views):

@@ -101,7 +101,7 @@ def center_crop(views: Views, fraction: float) -> Views:
     intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
     cameras = replace(views.cameras, intrinsics=intrinsics, height=rows, width=columns)
-    maps = {name: getattr(views, name) for name in ("depths", "masks", "disparities")}
+    maps = {name: getattr(views, name) for name in ("depths", "masks", "alphas", "disparities")}
     return Views(
         cameras=cameras.resized(height, width),
         images=interpolate(images, (height, width), mode="bilinear"),

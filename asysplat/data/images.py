@@ -142,6 +142,24 @@ def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     return _read(path, _to_rgb)
 
 
+def load_reduced(path: ImageFile, least: int) -> UInt8[ndarray, "h w 3"]:
+    """Read an image as `load_image`, a JPEG at 1/2, 1/4 or 1/8 of its size, which takes less time.
+
+    If both sides then have at least `least` pixels, and divide without a rest.
+    """
+
+    def read(image: OpenedImage) -> UInt8[ndarray, "h w 3"]:
+        for factor in (8, 4, 2):
+            width, height = (side // factor for side in image.size)
+            whole = (width * factor, height * factor) == image.size
+            if image.format == "JPEG" and whole and min(width, height) >= least:
+                image.draft(None, (width, height))
+                break
+        return _to_rgb(image)
+
+    return _read(path, read)
+
+
 def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
     """Read the stored integers of a one-channel (16-bit) image; 0 where unknown."""
     stored = _read(path, np.asarray)
@@ -155,6 +173,14 @@ def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
 def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
     """Read a mask: True where the image is opaque; of one without alpha, where it is not black."""
     return _read(path, _to_mask)
+
+
+def load_alpha(path: ImageFile) -> UInt8[ndarray, "h w"]:
+    """Read how opaque an image is, in 0..255; of one without alpha, how bright.
+
+    Values of 0 and 1 alone are 0 and 255.
+    """
+    return _read(path, _to_alpha)
 
 
 def has_alpha(path: ImageFile) -> bool:
@@ -247,6 +273,13 @@ def _to_mask(image: Image.Image) -> Bool[ndarray, "h w"]:
     if image.has_transparency_data:
         return np.asarray(image.convert("RGBA"))[..., 3] == 255
     return np.asarray(image.convert("L")) > 0
+
+
+def _to_alpha(image: Image.Image) -> UInt8[ndarray, "h w"]:
+    if image.has_transparency_data:
+        return np.asarray(image.convert("RGBA"))[..., 3]
+    values = np.asarray(image.convert("L"))
+    return values if values.max(initial=0) > 1 else 255 * values
 
 
 def content_hash(file: ImageFile) -> str:

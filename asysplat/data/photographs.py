@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.data.background import Background, with_background
 from asysplat.data.bad_images import Policy
 from asysplat.data.cameras import CameraOptions, find_missing, refine_given
 from asysplat.data.check.matches import find_matches
-from asysplat.data.check.report import diagnose_cameras
+from asysplat.data.check.report import Verdict, diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.readers import open_scene
+from asysplat.data.readers.additions import MasksOf
 from asysplat.data.selection import evenly_spaced
 from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError
@@ -45,8 +47,10 @@ class Photographs:
     held_out_files: list[str]
     normalization: Normalization  # from the world of the files to the network's frame
     points: Float[Tensor, "P 3"] | None
+    background: Float[Tensor, "3"]  # RGB behind the Gaussians
     total: int = 0  # photographs of the scene
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # offset subtracted by `near_origin`
+    is_split: bool = False  # whether the data set itself says which images are held out
 
     @property
     def cameras(self) -> Cameras:
@@ -64,16 +68,19 @@ class Photographs:
             self,
             inputs=self.inputs.to(device),
             held_out=None if self.held_out is None else self.held_out.to(device),
+            background=self.background.to(device),
             points=None if self.points is None else self.points.to(device),
         )
 
     def all_views(self) -> Views:
         """Return the inputs and the held-out views as one, without depths."""
         parts = [views for views in (self.inputs, self.held_out) if views is not None]
-        masks = [views.masks for views in parts if views.masks is not None]
         images = torch.cat([views.images for views in parts])
-        all_masks = torch.cat(masks) if len(masks) == len(parts) else None
-        return Views(self.cameras, images, masks=all_masks)
+        maps = {}
+        for name in ("masks", "alphas"):
+            values = [getattr(views, name) for views in parts if getattr(views, name) is not None]
+            maps[name] = torch.cat(values) if len(values) == len(parts) else None
+        return Views(self.cameras, images, **maps)
 
 
 def open_photographs(
@@ -85,6 +92,8 @@ def open_photographs(
     max_held_out: int = 12,
     layout: str = "auto",
     on_error: Policy = "fail",
+    masks: MasksOf = "auto",
+    background: Background = "auto",
     cameras: CameraOptions = GIVEN,
     say: Callable[[str], None] = print,
 ) -> Photographs:
@@ -97,7 +106,10 @@ def open_photographs(
         views, max_held_out: number of input and of held-out views, at most; views None: as many
             input views as MAX_BYTES hold.
         cameras: choice of given, refined or found cameras.
-        held_out_every: hold out every n-th photograph, from the first on; None: none.
+        held_out_every: hold out every n-th photograph, from the first on, or those that the data
+            set holds out, if it names some; None: none.
+        masks: whether masks are of an "object", or of what to "ignore"; "auto": see `with_masks`.
+        background: color behind an object; see `with_background`.
         say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
 
     Raises:
@@ -116,7 +128,7 @@ def open_photographs(
     if found := find_missing(path, layout, on_error, cameras):
         say(f"cameras: found, see {found}")
         path, layout = found, "auto"
-    scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_error)).scene
+    scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_error, masks)).scene
     if any(scene.origin):
         say(f"the scene is far from the origin: its new origin is {scene.origin} of the files.")
     lens = scene.images[0].lens
@@ -128,8 +140,9 @@ def open_photographs(
     if views is None:
         views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
     indices = range(len(scene.images))
-    held_out = list(indices[::held_out_every]) if held_out_every else []
-    rest = sorted(set(indices) - set(held_out))
+    published = [index for index in indices if scene.images[index].held_out]
+    held_out = published or indices[::held_out_every] if held_out_every else []
+    rest = sorted(set(indices) - set(held_out) - set(published))
     if len(rest) < 2:
         raise InputError(
             f"{path} has {len(scene.images)} photographs, of which held_out_every={held_out_every} "
@@ -138,16 +151,11 @@ def open_photographs(
     inputs = evenly_spaced(rest, min(views, len(rest)))
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
-        selected = sorted((*inputs, *held_out))
-        part = replace(scene, images=[scene.images[index] for index in selected])
-        part, matched = refine_given(part, cameras, say)
-        images = dict(enumerate(scene.images)) | dict(zip(selected, part.images, strict=True))
-        scene = replace(part, images=list(images.values()))
-        if not matched:
-            _warn_of_wrong_cameras(scene, say)
+        scene = _with_chosen_cameras(scene, sorted((*inputs, *held_out)), cameras, say)
     sequence = FileSequence(scene, SceneOptions(height, width))
     both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
     input_views, targets, normalization = normalize(*both)
+    input_views, targets, color = with_background(input_views, targets, background, say)
     files = [str(image.file) for image in scene.images]
     return Photographs(
         name=scene.name,
@@ -156,28 +164,47 @@ def open_photographs(
         input_files=[files[index] for index in inputs],
         held_out_files=[files[index] for index in held_out],
         normalization=normalization,
+        background=color,
         points=normalized_points(scene.points, normalization),
         total=len(scene.images),
         origin=scene.origin,
+        is_split=bool(published),
     )
 
 
-def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> None:
-    """Warn if matching points of the photographs show that the cameras do not fit them.
+def _with_chosen_cameras(
+    scene: PosedScene, selected: list[int], cameras: CameraOptions, say: Callable[[str], None]
+) -> PosedScene:
+    """Return a scene whose selected photographs have the chosen cameras; warn of wrong ones."""
+    if cameras.choice == "checked" and _diagnose(scene).fits:
+        say("cameras: as given (cameras=); they fit the points that some photographs share")
+        return scene
+    part = replace(scene, images=[scene.images[index] for index in selected])
+    part, agree = refine_given(part, cameras, say)
+    images = dict(enumerate(scene.images)) | dict(zip(selected, part.images, strict=True))
+    scene = replace(part, images=list(images.values()))
+    if agree:
+        return scene
+    verdict = _diagnose(scene)
+    if not verdict.fits and verdict.fit is not None:  # else too few points match to tell
+        say(
+            f"warning: {verdict.summary}; asysplat check shows it at full size. "
+            "The reconstruction goes on."
+        )
+    return scene
 
-    All photographs are matched: neighbors among the inputs may be too far apart.
+
+def _diagnose(scene: PosedScene) -> Verdict:
+    """Compare cameras with points that photographs share.
+
+    All photographs may be matched: neighbors among the inputs may be too far apart.
     """
     lens = scene.images[0].lens
     scale = min(1.0, MATCHED_SIDE / min(lens.height, lens.width))
     height, width = (max(1, round(scale * side)) for side in (lens.height, lens.width))
     matched = FileSequence(scene, SceneOptions(height, width))
     files = [str(image.file) for image in scene.images]
-    verdict = diagnose_cameras(matched.cameras, find_matches(matched), files)
-    if not verdict.fits and verdict.fit is not None:  # else too few points match to tell
-        say(
-            f"warning: {verdict.summary}; asysplat check shows it at full size. "
-            "The reconstruction goes on."
-        )
+    return diagnose_cameras(matched.cameras, find_matches(matched), files)
 
 
 def normalized_points(

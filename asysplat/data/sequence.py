@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,9 +19,10 @@ from asysplat.data.images import (
     ImageFile,
     Lens,
     content_hash,
+    load_alpha,
     load_depth,
-    load_image,
     load_mask,
+    load_reduced,
     resize_and_crop,
     resized_intrinsics,
     same_proportions,
@@ -32,6 +33,7 @@ from asysplat.scene import Cameras, Views
 
 # A scene is moved if its cameras are this far from the origin, in units and in their extent.
 FAR = 100.0
+OVERSAMPLING = 4  # least pixels along a side from which one of a view is computed
 MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
 Points = Float[ndarray, "P 3"]
 
@@ -68,6 +70,7 @@ class SceneOptions:
     Args:
         on_error: "fail" raises one error that names every image that cannot be used; "skip"
             leaves those images out with a warning, and decodes each image once to find them.
+        masks: whether masks are of an object or of what to ignore; see `with_masks`.
         cache: keeps decoded pixels; None keeps none.
         disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
     """
@@ -76,6 +79,7 @@ class SceneOptions:
     width: int
     layout: str = "auto"
     on_error: Policy = "fail"
+    masks: Literal["auto", "object", "ignore"] = "auto"
     cache: ImageCache | None = None
     disparities: Path | str | None = None
 
@@ -88,6 +92,8 @@ class PosedImage:
         cam_to_world: rigid, OpenCV axes.
         depth: one-channel integer image of distances along z, `depth_unit` scene units each.
         mask: image that is 0 where the pixel must be ignored; see `load_mask`.
+        is_object: the mask is of an object, and where it is 0 there is nothing; see `load_alpha`.
+        held_out: whether the data set keeps the image to measure what was fitted to the others.
         disparity: one-channel integer image of inverse depths, up to a scale and a shift; 0 where
             unknown.
     """
@@ -98,6 +104,8 @@ class PosedImage:
     depth: Path | None = None
     depth_unit: float = 1.0
     mask: Path | None = None
+    is_object: bool = False
+    held_out: bool = False
     disparity: Path | None = None
 
 
@@ -148,7 +156,8 @@ class FileSequence:
 
     `views` reads pixels, undistorts them, resizes them until the shorter side fits, and crops them
     to the center. If any image has a depth map, all views have depths (0 where unknown), and
-    likewise disparities; if any has a mask or a distorting lens, all have masks.
+    likewise disparities and alphas (1 where unknown); if any has a mask or a distorting lens, all
+    have masks. Transparent pixels are white.
     """
 
     def __init__(self, scene: PosedScene, options: SceneOptions):
@@ -165,7 +174,10 @@ class FileSequence:
         )
         self._has_depths = any(image.depth for image in images)
         self._has_disparities = any(image.disparity for image in images)
-        self._has_masks = any(image.mask or image.lens.is_distorted for image in images)
+        self._has_alphas = any(image.is_object for image in images)
+        self._has_masks = any(
+            (image.mask and not image.is_object) or image.lens.is_distorted for image in images
+        )
 
     @property
     def points(self) -> Points | None:
@@ -183,6 +195,7 @@ class FileSequence:
             images=torch.stack([self._image(image) for image in images]),
             depths=stack(self._has_depths, self._depth),
             masks=stack(self._has_masks, self._mask),
+            alphas=stack(self._has_alphas, self._alpha),
             disparities=stack(self._has_disparities, self._disparity),
         )
 
@@ -200,8 +213,21 @@ class FileSequence:
         return self.with_images(intact)
 
     def _image(self, image: PosedImage) -> Float[Tensor, "3 H W"]:
-        pixels = self._pixels(image.file, load_image, image.lens)
-        return pixels.permute(2, 0, 1).float() / 255
+        least = OVERSAMPLING * max(self.options.height, self.options.width)
+
+        def load_photograph(file: ImageFile) -> ndarray:
+            return load_reduced(file, least)
+
+        pixels = self._pixels(image.file, load_photograph, image.lens)
+        pixels = pixels.permute(2, 0, 1).float() / 255
+        if image.is_object and image.mask != image.file:
+            return 1 - self._alpha(image) * (1 - pixels)
+        return pixels
+
+    def _alpha(self, image: PosedImage) -> Float[Tensor, "H W"]:
+        if image.mask is None or not image.is_object:
+            return torch.ones(self.options.height, self.options.width)
+        return self._pixels(image.mask, load_alpha, image.lens).float() / 255
 
     def _depth(self, image: PosedImage) -> Float[Tensor, "H W"]:
         return self._map(image.depth, load_depth, image.lens) * image.depth_unit
@@ -225,7 +251,7 @@ class FileSequence:
 
     def _mask(self, image: PosedImage) -> Bool[Tensor, "H W"]:
         lens = image.lens
-        if image.mask is None:
+        if image.mask is None or image.is_object:
             return torch.tensor(self._fit(np.ones((lens.height, lens.width), dtype=bool), lens))
         return self._pixels(image.mask, load_mask, lens)
 

@@ -9,9 +9,9 @@ from asysplat.errors import InputError
 from asysplat.runs.run_config import read_config
 from asysplat.runs.runs import RESULTS, SCENE, find_reconstructions, folder_of
 
-OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_error", "height", "width")
-OF_PHOTOGRAPHS += ("views", "held_out_every", "max_held_out")
-OF_QUALITY = ("height", "views")  # those that quality= sets
+OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_error", "masks", "background")
+OF_PHOTOGRAPHS += ("height", "width", "views", "held_out_every", "max_held_out")
+OF_QUALITY = ("height", "views", "cameras")  # those that quality= sets
 
 
 def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:

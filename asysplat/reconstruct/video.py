@@ -67,7 +67,9 @@ def video_cameras(
         find_views(video, photographs.input_files, photographs.held_out_files)
     )
     if video.path == "orbit" and isinstance(scene, Gaussians):
-        path = orbit(cameras, frames, subject(scene, cameras), scene)
+        is_object = photographs.inputs.alphas is not None
+        focus = scene.means.median(0).values if is_object else subject(scene, cameras)
+        path = orbit(cameras, frames, focus, scene)
     else:
         path = smoothed_path(cameras, frames, as_given=video.path != "own")
     if video.height is None:

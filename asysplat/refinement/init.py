@@ -11,6 +11,7 @@ from asysplat.errors import InputError
 from asysplat.kernels.dispatch import to_float64
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
+from asysplat.refinement.hull import within_hull
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.scaffold_gs import ScaffoldSettings
 from asysplat.refinement.settings import RefinementSettings
@@ -70,6 +71,7 @@ def initial_gaussians(
         pixels = longest / max(prior.distance.shape[-2:])
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
+    gaussians = within_hull(gaussians, inputs)
     return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), settings.initial_limit)
 
 

@@ -29,6 +29,7 @@ from asysplat.refinement.fields import (
     correct_exposure,
     correct_poses,
 )
+from asysplat.refinement.hull import within_hull
 from asysplat.refinement.isotropic import footprints, random_order
 from asysplat.refinement.settings import DEFAULT, RefinementSettings
 from asysplat.rendering import render
@@ -207,7 +208,8 @@ def refine(
 ) -> Gaussians:
     """Refine Gaussians for some seconds or steps, at most for the settings' `max_steps`.
 
-    With `steps`, the same inputs and seed give the same bits on a CPU.
+    Of an object, whose views have alphas, those are left that lie in its visual hull. With `steps`,
+    the same inputs and seed give the same bits on a CPU.
 
     Args:
         gaussians, views, background, settings, seed: see `Refinement`.
@@ -230,7 +232,7 @@ def refine(
         small.step(0.0)
         small.densify(0.0)
     run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
-    return refinement.gaussians
+    return within_hull(refinement.gaussians, views)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from asysplat.data.images import (
     load_depth,
     load_image,
     load_mask,
+    load_reduced,
     resize_and_crop,
     resized_intrinsics,
     undistort,
@@ -146,6 +147,19 @@ def test_transparent_pixels_become_white(tmp_path):
     loaded = load_image(tmp_path / "a.png")
     assert loaded[0, 1].tolist() == [200, 100, 0] and loaded[1, 1].tolist() == [255] * 3
     assert np.abs(loaded[0, 0].astype(int) - (244, 224, 204)).max() <= 1
+
+
+@pytest.mark.parametrize(("least", "factor"), [(601, 1), (600, 2), (250, 4), (20, 8)])
+def test_a_jpeg_is_decoded_at_the_least_size_that_is_enough(tmp_path, least, factor):
+    x, y = np.meshgrid(np.arange(1600) / 1600, np.arange(1200) / 1200)
+    pixels = (255 * np.stack((x, y, (1 + np.sin(20 * x)) / 2), -1)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=95)
+    reduced = load_reduced(tmp_path / "a.jpg", least)
+    assert reduced.shape == (1200 // factor, 1600 // factor, 3)
+    small = [resize_and_crop(image, 60, 80) for image in (reduced, load_image(tmp_path / "a.jpg"))]
+    assert np.abs(np.subtract(*small, dtype=np.int64)).max() <= 2
+    Image.fromarray(pixels[:, 1:]).save(tmp_path / "odd.jpg")
+    assert load_reduced(tmp_path / "odd.jpg", 20).shape == (1200, 1599, 3)
 
 
 def test_load_image_does_not_apply_exif_orientation(tmp_path):

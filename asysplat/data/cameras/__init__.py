@@ -14,7 +14,7 @@ from asysplat.data.readers import without_cameras
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 
-CHOICES = ("auto", "given", "refined", "found")
+CHOICES = ("auto", "given", "checked", "refined", "found")
 LEAST_GAIN = 0.01  # fraction of the reprojection error; refined cameras that gain less are not used
 # Features for each match, from which on given cameras are near the truth: 0.35 to 0.6 of good ones,
 # below 0.2 if axes, order, focal length or direction of the matrices are wrong.
@@ -26,7 +26,8 @@ class CameraOptions:
     """Which cameras of photographs are used."""
 
     # "given" with the photographs; "refined" from those; "found" by structure from motion, as
-    # always where none are given; "auto": refined if that lowers the error by LEAST_GAIN.
+    # always where none are given; "auto": refined if that lowers the error by LEAST_GAIN;
+    # "checked": as given if points that some photographs share agree, else as "auto".
     choice: str = "given"
     where: Path = Path("logs/cameras")  # folder of found and refined cameras
     frames: int = 100  # greatest number, of a video
@@ -51,7 +52,7 @@ def refine_given(
     scene: PosedScene, options: CameraOptions, say: Callable[[str], None]
 ) -> tuple[PosedScene, bool]:
     """Return a scene with refined cameras where wanted, and whether the given ones are right."""
-    if options.choice not in ("auto", "refined"):
+    if options.choice in ("given", "found"):
         return scene, False
     images = [image for image in scene.images if image.lens.model != PANORAMA]
     files = {image.file for image in images if isinstance(image.file, Path)}

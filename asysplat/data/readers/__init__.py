@@ -20,10 +20,13 @@ from asysplat.data import frames
 from asysplat.data.bad_images import BadImages
 from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
+    blender,
     colmap,
     dl3dv,
+    idr,
     llff,
     long_lrm,
+    middlebury,
     posed,
     realestate10k,
     replica,
@@ -31,7 +34,7 @@ from asysplat.data.readers import (
     scannetpp_depths,
     transforms,
 )
-from asysplat.data.readers.additions import with_faces, with_masks
+from asysplat.data.readers.additions import MasksOf, with_faces, with_masks
 from asysplat.data.readers.common import SUFFIXES, file_errors, images_in, natural_order
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
@@ -39,8 +42,8 @@ from asysplat.files import check_exists
 
 # In this order: the first layout that fits a folder reads it.
 READERS = (
-    *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap),
-    scannetpp_depths,
+    *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, blender, llff, posed, idr),
+    *(middlebury, colmap, scannetpp_depths),
 )
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 
@@ -93,13 +96,13 @@ def photographs_in(root: Path) -> list[Path]:
     return sorted(images_in(root) or images_in(root / "images"), key=natural_order)
 
 
-def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
+def read_scene(layout: str, scene: Path, bad: BadImages, masks: MasksOf = "auto") -> PosedScene:
     """Read one of the `find_scenes` with its images' masks, and panoramas as their faces.
 
     Errors of single images are collected.
     """
     with file_errors(scene):
-        return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad), bad)
+        return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad, masks), bad)
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
@@ -112,7 +115,7 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
     bad = BadImages(options.on_error)
-    posed = read_scene(layout, path, bad)
+    posed = read_scene(layout, path, bad, options.masks)
     if options.disparities is not None:
         posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)

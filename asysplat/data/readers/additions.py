@@ -1,50 +1,78 @@
 """What is added to a scene that a reader has read: masks, and the faces of panoramas."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from PIL import Image
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.images import PANORAMA, Lens, has_alpha, same_proportions
+from asysplat.data.images import PANORAMA, Lens, has_alpha, load_alpha, same_proportions
 from asysplat.data.readers.common import check_map_size
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
-FOLDER = "masks"
+FOLDERS = ("masks", "mask", "images_mask")
+MasksOf = Literal["auto", "object", "ignore"]
+REMOVE_BG = "-removebg-preview.png"  # what remove.bg adds to a name
+DECIDING = 8  # masks, at most, that decide whether they are of an object
+BORDER_SIDE = 64  # pixels to which a mask is shrunk to look at its border
+MAX_KEPT = 0.1  # fraction of the border that most masks of an object keep
 
 
-def with_masks(scene: PosedScene, bad: BadImages) -> PosedScene:
+def with_masks(scene: PosedScene, bad: BadImages, masks: MasksOf = "auto") -> PosedScene:
     """Return a scene whose images have masks where there are any, see `find_mask`.
 
     Masks that the files of a scene name themselves stay. Errors of single images are collected.
+    `masks` says whether they are of an object, and where they are 0 there is nothing, or what they
+    leave out is to be ignored; "auto" takes them for an object's if most borders are left out.
+    Transparent photographs are of an object.
     """
 
     def read(image: PosedImage) -> PosedImage:
-        if image.mask is not None or not isinstance(image.file, Path):
-            return image
-        mask = find_mask(image.file)
-        size = (image.lens.width, image.lens.height)
-        return replace(image, mask=mask and check_map_size(mask, size, str(image.file)))
+        if image.mask is None and isinstance(image.file, Path):
+            mask = find_mask(image.file)
+            size = (image.lens.width, image.lens.height)
+            image = replace(image, mask=mask and check_map_size(mask, size, str(image.file)))
+        is_object = image.mask is not None and image.mask == image.file and masks != "ignore"
+        return replace(image, is_object=is_object)
 
-    return replace(scene, images=bad.read_each(read, ((image,) for image in scene.images)))
+    images = bad.read_each(read, ((image,) for image in scene.images))
+    separate = [image.mask for image in images if image.mask not in (None, image.file)]
+    if separate and (masks == "object" or (masks == "auto" and are_of_an_object(separate))):
+        images = [replace(image, is_object=image.mask is not None) for image in images]
+    return replace(scene, images=images)
+
+
+def are_of_an_object(masks: Sequence[Path]) -> bool:
+    """Return whether most masks leave out the borders, as those of an object in the middle do."""
+    size, kept = (BORDER_SIDE, BORDER_SIDE), []
+    for mask in masks[:: -(-len(masks) // DECIDING)]:
+        pixels = np.asarray(Image.fromarray(load_alpha(mask)).resize(size)) > 127
+        kept.append(np.mean([*pixels[[0, -1]].flat, *pixels[:, [0, -1]].flat]))
+    return float(np.median(kept)) < MAX_KEPT
 
 
 def find_mask(photograph: Path) -> Path | None:
-    """Return the mask of a photograph, which is 0 where a pixel must be ignored; None without one.
+    """Return the mask of a photograph; None without one.
 
     Of images/a/b.jpg it is masks/a/b.jpg.png (as COLMAP names it), masks/a/b.png (nerfstudio) or
-    masks/a/b.jpg, and of b.jpg in a folder of another name it is in masks/ there; else it is the
-    photograph itself, where that has an alpha channel.
+    masks/a/b.jpg, and of b.jpg in a folder of another name it is in masks/ there; the folder may
+    also be one of the other FOLDERS. Else it is the photograph itself, where that has an alpha
+    channel.
     """
-    folder = photograph.parent
+    folder, inner = photograph.parent, Path()
     images = next((f for f in (folder, folder.parent) if f.name.startswith("images")), None)
-    if images is None:
-        masks = folder / FOLDER
-    else:
-        masks = images.parent / FOLDER / folder.relative_to(images)
-    for name in (f"{photograph.name}.png", f"{photograph.stem}.png", photograph.name):
-        if (masks / name).is_file():
-            return masks / name
+    if images is not None:
+        folder, inner = images.parent, folder.relative_to(images)
+    stem = photograph.stem
+    names = (f"{photograph.name}.png", f"{stem}.png", photograph.name, f"{stem}{REMOVE_BG}")
+    paths = (folder / masks / inner / name for masks in FOLDERS for name in names)
+    if mask := next((path for path in paths if path.is_file()), None):
+        return mask
     return photograph if has_alpha(photograph) else None
 
 

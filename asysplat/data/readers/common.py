@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -33,7 +34,7 @@ def file_errors(path: Path) -> Generator[None]:
         yield
     except InputError:
         raise
-    except (OSError, LookupError, TypeError, ValueError) as error:
+    except (OSError, LookupError, TypeError, ValueError, BadZipFile) as error:
         raise InputError(f"{path} cannot be read ({brief(error)}): repair its files.") from error
 
 

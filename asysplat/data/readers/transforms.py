@@ -25,6 +25,7 @@ from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # read as OPENCV
+SUFFIXES = (".png", ".jpg", ".jpeg")
 DISTORTIONS = {  # names of the parameters of the others, in COLMAP's order
     "OPENCV": "k1 k2 p1 p2",
     "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6",
@@ -64,14 +65,12 @@ def read_images(
         resized: whether images may have another size than w x h, to which the intrinsics belong.
     """
     folder = folder or file.parent
+    held_out = {*content.get("test_filenames", content.get("val_filenames", ()))}
     shared: list[tuple[Path, tuple[int, int]]] = []  # images without w and h of their own
 
     def read(index: int, entry: Any) -> PosedImage:
         where = common.frame_label(file, index, entry)
-        image = folder / entry["file_path"]
-        # The path may lack the file's extension.
-        paths = [image.with_name(image.name + suffix) for suffix in ("", ".png", ".jpg")]
-        image = next((path for path in paths if path.is_file()), image)
+        image = _find_image(folder, folder / entry["file_path"])
         size = image_size(image)
         if not ("w" in entry and "h" in entry):
             shared.append((image, size))
@@ -82,6 +81,9 @@ def read_images(
                     "images of one size, or w, h and intrinsics for every image."
                 )
         fields = {**content, **entry}
+        if "K" in fields:
+            (fx, _, cx), (_, fy, cy), *_ = fields["K"]
+            fields = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy} | fields
         pose = common.check_rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
 
         def optional_map(key: str) -> Path | None:
@@ -97,12 +99,25 @@ def read_images(
             depth=optional_map("depth_file_path"),
             depth_unit=float(fields.get("depth_unit_scale_factor", common.MILLIMETERS)),
             mask=optional_map("mask_path"),
+            held_out=entry["file_path"] in held_out,
         )
 
     images = bad.read_each(read, enumerate(content["frames"]))
     if all(re.search(r"\d", Path(str(image.file)).stem) for image in images):
         images.sort(key=lambda image: common.natural_order(Path(str(image.file))))
     return images
+
+
+def _find_image(folder: Path, named: Path) -> Path:
+    """Return the image of a path, which may lack its suffix, or be of another machine.
+
+    It is then in the folder of the same name, or in `folder`, perhaps saved in another format.
+    """
+    places = (named.parent, folder / named.parent.name, folder)
+    names = [named.name, *(f"{named.name}{suffix}" for suffix in SUFFIXES)]
+    names += [f"{named.stem}{suffix}" for suffix in SUFFIXES]
+    paths = (place / name for place in places for name in names)
+    return next((path for path in paths if path.is_file()), named)
 
 
 def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:

@@ -24,7 +24,7 @@ from asysplat.models.prior.projections import (
     smallest_step,
 )
 from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
-from asysplat.scene import Cameras, Views, whole_pixels
+from asysplat.scene import Cameras, Views
 
 PLANES = 48
 NEIGHBORS = 4
@@ -58,9 +58,7 @@ class PlaneSweepPrior(nn.Module):
             inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
             inverse = F.max_pool2d(inverse, factor).flatten(2)
             ranges = observed_range(inverse, inverse > 0)
-        masks = views.masks
-        if masks is not None:
-            masks = whole_pixels(masks, (small.height, small.width))
+        masks = views.surfaces((small.height, small.width))
         estimate = plane_sweep(
             images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges, masks=masks
         )

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import Consistency, load_backend
-from asysplat.scene import TensorRecord, Views, whole_pixels
+from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of ResidualHead's range
@@ -63,8 +63,8 @@ class Prior(TensorRecord):
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
         dropped = F.interpolate(in_free_space(votes).to(opacity), size, mode="area") > 0.5
-        if views.masks is not None:
-            dropped = dropped | ~whole_pixels(views.masks, size)
+        if (surfaces := views.surfaces(size)) is not None:
+            dropped = dropped | ~surfaces
         return cls(distance, confidence, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
 
     @classmethod
@@ -81,8 +81,8 @@ class Prior(TensorRecord):
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
         projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
-        if views.masks is not None:
-            confidence = confidence * whole_pixels(views.masks, size)
+        if (surfaces := views.surfaces(size)) is not None:
+            confidence = confidence * surfaces
         votes = count_votes(inverse, confidence, others, projections)
         return cls.from_estimate(DepthEstimate(inverse, confidence, votes), views, size)
 

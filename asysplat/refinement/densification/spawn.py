@@ -9,6 +9,7 @@ from torch import Tensor
 
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.fields import Fields
+from asysplat.refinement.hull import is_outside
 from asysplat.refinement.isotropic import isotropic_gaussians, random_permutation
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
@@ -44,6 +45,7 @@ class ErrorDensifier(Densifier):
         # Every view has been used twice since.
         unseen = self._steps - self._last_visible > 2 * views.num_views
         useful = (opacities > MIN_OPACITY) & ~unseen
+        useful &= ~is_outside(self.fields.gaussians().means, views)
         useful[opacities.argmax()] = True  # never prune all
         rows = torch.nonzero(useful)[:, 0]
         self.fields.keep(rows)
@@ -78,6 +80,8 @@ def spawn_at_errors(
     error = F.avg_pool2d(error, ERROR_WINDOW, stride=1, padding=ERROR_WINDOW // 2) * (depth > 0)
     if views.masks is not None:
         error = error * views.masks
+    if views.alphas is not None:
+        error = error * (views.alphas > 0)
     count = min(count, int((error > 0).sum()))
     # torch.multinomial is limited to 2^24 pixels. The smallest of exponential times with these
     # rates sample the same distribution (Efraimidis and Spirakis 2006).

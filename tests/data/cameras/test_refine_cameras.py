@@ -159,9 +159,12 @@ def test_which_cameras_are_used(views, folder, tmp_path):
     write_transforms(views, exact)
     fx, said = opened("auto", exact)
     assert fx == pytest.approx(focal, rel=1e-6) and said[0].startswith("cameras: as given")
+    fx, said = opened("checked", exact)
+    assert fx == pytest.approx(focal, rel=1e-6) and "they fit the points" in said[0]
     # Features are matched once, and again only if those that agree with the cameras are few.
-    assert len(said) == 1
+    assert len(opened("auto", exact)[1]) == 1
     poses = views.cameras.cam_to_world * torch.tensor([1.0, -1, -1, 1])
     turned = Views(replace(views.cameras, cam_to_world=poses), views.images)
     write_transforms(turned, tmp_path / "turned")
-    assert any("OpenGL axes" in sentence for sentence in opened("auto", tmp_path / "turned")[1])
+    for choice in ("auto", "checked"):
+        assert any("OpenGL axes" in each for each in opened(choice, tmp_path / "turned")[1])

@@ -8,10 +8,11 @@ import pytest
 import torch
 from layouts import assert_listed, assert_same, cut, opener, save_depth
 
+from asysplat import open_photographs
 from asysplat.data import find_scenes
 from asysplat.errors import InputError
 
-CUT = (".json", ".npy", ".txt", ".bin", ".torch")  # files of cameras and points
+CUT = (".json", ".npy", ".npz", ".txt", ".bin", ".torch")  # files of cameras and points
 NAMES = [module.name for module in iter_modules(layouts.__path__)]
 FILES = [name for name in NAMES if name != "realestate10k"]  # which has images inside a file
 DEPTHS = [name for name in NAMES if getattr(import_module(f"layouts.{name}"), "HAS_DEPTHS", True)]
@@ -76,3 +77,19 @@ def test_depths_may_be_smaller(name, few, tmp_path):
     for image in opener(name)(scene).scene.images:
         save_depth(image.depth, torch.full((12, 16), 2.125))
     assert opener(name)(scene).views([0]).depths.unique().tolist() == [2.125]
+
+
+def test_images_that_blender_s_scenes_test_are_held_out(centered_views, tmp_path):
+    write = import_module("layouts.blender").write
+    alphas = torch.ones(12, 24, 32)
+    alphas[:, :8] = 0
+    write(centered_views.select(range(8)), tmp_path, alphas=alphas)
+    write(centered_views.select(range(8, 12)), tmp_path, "test", alphas)
+    photographs = open_photographs(tmp_path, height=24, say=lambda text: None)
+    assert photographs.is_split and photographs.background.tolist() == [1, 1, 1]
+    names = [f"test/r_{index}.png" for index in range(4)]
+    assert [file.removeprefix(f"{tmp_path}/") for file in photographs.held_out_files] == names
+    assert photographs.inputs.num_views == 8 and (photographs.inputs.alphas[:, :8] == 0).all()
+    assert (photographs.inputs.images[:, :, :8] == 1).all()
+    alone = open_photographs(tmp_path, height=24, held_out_every=None, say=lambda text: None)
+    assert alone.held_out is None and alone.inputs.num_views == 8

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from layouts import assert_listed, opener
+from layouts import assert_listed, assert_same, opener
 from layouts import transforms as layout
 from PIL import Image
+
+from asysplat.errors import InputError
 
 opened = opener("transforms")
 
@@ -57,19 +59,67 @@ def test_a_mask_that_the_scene_names_is_used(few, tmp_path):
     assert torch.equal(opened(folder).views([1]).masks[0], ~half())
 
 
-def test_alpha_is_a_mask(few, tmp_path):
-    folder = layout.write(few, tmp_path)
-    image = folder / "images" / "00002.png"
+def make_transparent(image, alpha):
     pixels = np.asarray(Image.open(image))
-    alpha = np.where(half().numpy(), 255, 0).astype(np.uint8)
-    alpha[:, 20] = 254  # what is a little transparent has a color that is mixed with white
-    Image.fromarray(np.dstack([pixels, alpha])).save(image)
+    Image.fromarray(np.dstack([pixels, (255 * alpha.numpy()).astype(np.uint8)])).save(image)
+
+
+def test_alpha_is_transparency(few, tmp_path):
+    folder = layout.write(few, tmp_path)
+    alpha = half().float()
+    alpha[:, 20] = 0.4
+    make_transparent(folder / "images" / "00002.png", alpha)
+    views = opened(folder).views(range(4)).validate()
+    assert views.masks is None and (views.alphas[[0, 1, 3]] == 1).all()
+    torch.testing.assert_close(views.alphas[2], alpha)
+    on_white = alpha * few.images[2].float() + 1 - alpha
+    torch.testing.assert_close(views.images[2], on_white, rtol=0, atol=1 / 255)
+    green = torch.tensor([0.0, 1.0, 0.0])
+    on_green = alpha * few.images[2].float() + (1 - alpha) * green[:, None, None]
+    found = views.over(torch.ones(3), green).images[2]
+    torch.testing.assert_close(found, on_green, rtol=0, atol=1 / 255)
+    masks = opened(folder, masks="ignore").views(range(4)).masks
+    assert torch.equal(masks[2], alpha == 1) and masks[[0, 1, 3]].all()
+
+
+def middle(height=24, width=32):
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    mask[4:-4, 4:-4] = True
+    return mask
+
+
+def test_masks_that_leave_out_the_borders_are_of_an_object(few, tmp_path):
+    folder = layout.write(few, tmp_path)
+    for index in range(4):
+        save(middle(12, 16), folder / "mask" / f"{index:05d}.png")  # of half the size
     views = opened(folder).views(range(4))
-    expected = half()
-    expected[:, 20] = False
-    assert torch.equal(views.masks[2], expected) and views.masks[[0, 1, 3]].all()
-    kept = expected.expand(3, -1, -1)
-    assert torch.equal(views.images[2][kept], few.images[2].float()[kept])
+    assert views.masks is None and (views.alphas[:, 12, 16] > 0.9).all()
+    assert (views.images[views.alphas[:, None].expand(-1, 3, -1, -1) == 0] == 1).all()
+    ignored = opened(folder, masks="ignore").views(range(4))
+    assert ignored.alphas is None and not ignored.masks[:, 0].any()
+    assert_same(ignored.images, few.images)
+
+
+def test_masks_of_what_to_ignore_may_be_said_to_be_of_an_object(few, tmp_path):
+    folder = layout.write(few, tmp_path)
+    save(half(), folder / "masks" / "00001.png")
+    alphas = opened(folder, masks="object").views(range(4)).alphas
+    assert torch.equal(alphas[1] == 1, half()) and (alphas[[0, 2, 3]] == 1).all()
+
+
+@pytest.mark.parametrize("mode", ["LA", "P", "PA", "I;16"])
+def test_other_kinds_of_alpha_are_read_or_named(few, tmp_path, mode):
+    folder = layout.write(few, tmp_path)
+    image = folder / "images" / "00000.png"
+    make_transparent(image, half().float())
+    if mode == "I;16":
+        Image.new(mode, (32, 24)).save(image)
+        with pytest.raises(InputError, match="save it as 8-bit RGB"):
+            opened(folder).views([0])
+        return
+    Image.open(image).convert(mode).save(image, format="tiff" if mode == "PA" else "png")
+    alphas = opened(folder).views([0]).alphas
+    assert torch.equal(alphas[0] == 1, half()) or mode == "P"  # a palette has one color for each
 
 
 def test_a_mask_of_other_proportions_is_named(few, tmp_path):

@@ -71,6 +71,43 @@ def test_field_of_view_alone_is_enough(scene):
     torch.testing.assert_close(intrinsics, expected)
 
 
+def test_intrinsics_may_be_a_matrix(scene):
+    matrix = [[30.0, 0, 11.5], [0, 31.0, 8.5], [0, 0, 1]]
+
+    def change(content):
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del content[key]
+        content["K"] = [[20.0, 0, 12.5], [0, 21.0, 7.5], [0, 0, 1]]
+        content["frames"][1]["K"] = matrix
+
+    intrinsics = open_scene(scene(change)).cameras.intrinsics
+    assert intrinsics[0].diagonal().tolist() == [20, 21, 1] and intrinsics[1].tolist() == matrix
+
+
+def test_images_are_found_beside_the_file_and_saved_in_another_format(scene):
+    def change(content):
+        for frame in content["frames"][:2]:
+            frame["file_path"] = frame["file_path"].replace("images", "/home/me/scene/images")
+        content["frames"][2]["file_path"] = "photos/2.png"
+
+    folder = scene(change)
+    Image.open(folder / "images/0.png").save(folder / "images/0.jpg")
+    (folder / "images/0.png").unlink()
+    (folder / "images/2.png").rename(folder / "2.png")
+    names = ("images/0.jpg", "images/1.png", "2.png", "images/3.png")
+    files = {image.file for image in open_scene(folder).scene.images}
+    assert files == {folder / name for name in names}
+
+
+def test_images_that_the_file_tests_are_held_out(scene):
+    def change(content):
+        names = [frame["file_path"] for frame in content["frames"]]
+        content["train_filenames"], content["test_filenames"] = names[:3], names[3:]
+
+    images = open_scene(scene(change)).scene.images
+    assert [image.held_out for image in images] == [False, False, False, True]
+
+
 def test_intrinsics_and_size_of_an_entry_win(scene):
     def change(content):
         content["frames"][1] |= {"w": 48, "h": 32, "fl_x": 50.0, "fl_y": 52.0, "cx": 25, "cy": 15}
