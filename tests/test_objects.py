@@ -8,7 +8,8 @@ import torch
 
 from asysplat import Gaussians, open_photographs, refine, render
 from asysplat.data import ProceduralScene
-from asysplat.data.background import find_background, with_background
+from asysplat.data.background import find_background
+from asysplat.data.photographs import with_background
 from asysplat.errors import InputError
 from asysplat.refinement.hull import is_outside
 from asysplat.refinement.init import initial_gaussians

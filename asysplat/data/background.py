@@ -1,7 +1,6 @@
 """The background of an object: what transparent pixels show, or one color at all borders."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.scene import Views
 
 RING = 0.02  # width of the border that is looked at, over the shorter side
 MIN_BORDER = 0.9  # fraction of a border that shows the background
@@ -21,34 +19,6 @@ MIN_TOLERANCE, MAX_TOLERANCE = 0.02, 0.08  # range of the tolerance, in the larg
 MAX_DIFFERENCE = 0.15  # between the colors of a border and of most
 COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 Background = str | Sequence[float | int]  # auto, mean, a name in COLORS, or RGB in [0, 1]
-
-
-def with_background(
-    inputs: Views, targets: Views, background: Background, say: Callable[[str], None]
-) -> tuple[Views, Views, Float[Tensor, "3"]]:
-    """Choose the color behind the Gaussians; transparent pixels of the views show it.
-
-    With "auto" it is white where photographs are transparent, else the color that all borders show,
-    else, and with "mean", the mean color of the inputs. Where borders show one color, the inputs
-    have alphas afterwards.
-    """
-    white = torch.ones(3)
-    color = None if background in ("auto", "mean") else _read_color(background)
-    if inputs.alphas is not None and bool((inputs.alphas < 0.5).any()):
-        if color is None:
-            color = white if background == "auto" else inputs.mean_color()
-        share = (inputs.alphas < 0.5).float().mean().item()
-        say(f"object: {share:.0%} of the pixels are {_name(color)} behind it (masks=, background=)")
-        return inputs.over(white, color), targets.over(white, color), color
-    inputs, targets = (replace(views, alphas=None) for views in (inputs, targets))
-    if background == "auto" and inputs.masks is None:
-        found = find_background(inputs.images)
-        if found is not None:
-            color, alphas = found
-            share = 1 - alphas.mean().item()
-            say(f"object: {share:.0%} of the pixels are {_name(color)} around it (background=)")
-            inputs = replace(inputs, alphas=alphas)
-    return inputs, targets, inputs.mean_color() if color is None else color
 
 
 def find_background(
@@ -86,7 +56,8 @@ def _outer(near: UInt8[ndarray, "H W"]) -> Bool[ndarray, "H W"]:
     return labels[1:-1, 1:-1] == labels[0, 0]
 
 
-def _read_color(background: Background) -> Float[Tensor, "3"]:
+def read_color(background: Background) -> Float[Tensor, "3"]:
+    """Return the color of a name, or of numbers."""
     color = COLORS.get(background) if isinstance(background, str) else tuple(background)
     if color is None or len(color) != 3 or not all(0 <= value <= 1 for value in color):
         raise InputError(
@@ -96,7 +67,8 @@ def _read_color(background: Background) -> Float[Tensor, "3"]:
     return torch.tensor(color, dtype=torch.float32)
 
 
-def _name(color: Float[Tensor, "3"]) -> str:
+def color_name(color: Float[Tensor, "3"]) -> str:
+    """Return a color's name, or its numbers."""
     values = tuple(color.tolist())
     named = next((name for name, known in COLORS.items() if known == values), None)
     return named or f"[{', '.join(f'{value:.2f}' for value in values)}]"

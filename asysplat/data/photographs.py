@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.data.background import Background, with_background
+from asysplat.data.background import Background, color_name, find_background, read_color
 from asysplat.data.bad_images import Policy
 from asysplat.data.cameras import CameraOptions, find_missing, refine_given
 from asysplat.data.check.matches import find_matches
@@ -170,6 +170,36 @@ def open_photographs(
         origin=scene.origin,
         is_split=bool(published),
     )
+
+
+def with_background(
+    inputs: Views, targets: Views, background: Background, say: Callable[[str], None]
+) -> tuple[Views, Views, Float[Tensor, "3"]]:
+    """Choose the color behind the Gaussians; transparent pixels of the views show it.
+
+    With "auto" it is white where photographs are transparent, else the color that all borders show,
+    else, and with "mean", the mean color of the inputs. Where borders show one color, the inputs
+    have alphas afterwards.
+    """
+    white = torch.ones(3)
+    color = None if background in ("auto", "mean") else read_color(background)
+    if inputs.alphas is not None and bool((inputs.alphas < 0.5).any()):
+        if color is None:
+            color = white if background == "auto" else inputs.mean_color()
+        share = (inputs.alphas < 0.5).float().mean().item()
+        name = color_name(color)
+        say(f"object: {share:.0%} of the pixels are {name} behind it (masks=, background=)")
+        return inputs.over(white, color), targets.over(white, color), color
+    inputs, targets = (replace(views, alphas=None) for views in (inputs, targets))
+    if background == "auto" and inputs.masks is None:
+        found = find_background(inputs.images)
+        if found is not None:
+            color, alphas = found
+            share = 1 - alphas.mean().item()
+            name = color_name(color)
+            say(f"object: {share:.0%} of the pixels are {name} around it (background=)")
+            inputs = replace(inputs, alphas=alphas)
+    return inputs, targets, inputs.mean_color() if color is None else color
 
 
 def _with_chosen_cameras(

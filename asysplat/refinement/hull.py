@@ -13,10 +13,9 @@ EDGE = 3  # pixels a side, all of background: at edges colors are mixed
 
 
 def is_outside(points: Float[Tensor, "N 3"], views: Views) -> Bool[Tensor, "N"]:
-    """Return whether several photographs show background at each point."""
+    """Return whether several photographs, with alphas, show background at each point."""
+    assert views.alphas is not None
     empty, seen = torch.zeros(2, len(points), device=points.device)
-    if views.alphas is None:
-        return empty > 0
     opaque = F.max_pool2d((views.alphas > 0).to(empty), EDGE, stride=1, padding=EDGE // 2)
     for view in range(views.num_views):
         (pixels,), _, (inside,) = views.cameras.select([view]).project(points)
@@ -28,7 +27,5 @@ def is_outside(points: Float[Tensor, "N 3"], views: Views) -> Bool[Tensor, "N"]:
 
 def within_hull(gaussians: Gaussians, views: Views) -> Gaussians:
     """Return the Gaussians whose centers are not outside; all if none is within."""
-    if views.alphas is None:
-        return gaussians
     inside = ~is_outside(gaussians.means, views)
     return gaussians.keep(inside) if inside.any() else gaussians

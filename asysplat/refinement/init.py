@@ -71,7 +71,8 @@ def initial_gaussians(
         pixels = longest / max(prior.distance.shape[-2:])
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
-    gaussians = within_hull(gaussians, inputs)
+    if inputs.alphas is not None:
+        gaussians = within_hull(gaussians, inputs)
     return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), settings.initial_limit)
 
 

@@ -232,7 +232,8 @@ def refine(
         small.step(0.0)
         small.densify(0.0)
     run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
-    return within_hull(refinement.gaussians, views)
+    refined = refinement.gaussians
+    return refined if views.alphas is None else within_hull(refined, views)
 
 
 @dataclass(frozen=True)

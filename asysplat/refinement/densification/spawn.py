@@ -45,7 +45,8 @@ class ErrorDensifier(Densifier):
         # Every view has been used twice since.
         unseen = self._steps - self._last_visible > 2 * views.num_views
         useful = (opacities > MIN_OPACITY) & ~unseen
-        useful &= ~is_outside(self.fields.gaussians().means, views)
+        if views.alphas is not None:
+            useful &= ~is_outside(self.fields.gaussians().means, views)
         useful[opacities.argmax()] = True  # never prune all
         rows = torch.nonzero(useful)[:, 0]
         self.fields.keep(rows)
