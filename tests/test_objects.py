@@ -90,6 +90,15 @@ def test_the_color_around_an_object_is_found_in_spite_of_noise_and_shading(views
     assert ((alphas == 0) == (views.alphas < 0.05)).float().mean() > 0.95
 
 
+def test_masked_pixels_do_not_show_the_color(views):
+    masks = torch.ones_like(views.alphas, dtype=torch.bool)
+    masks[:, :, :4] = False  # as beyond the border of a lens
+    plain = replace(views, alphas=None, masks=masks)
+    inputs, _, color = with_background(plain, plain, "auto", lambda text: None)
+    assert torch.equal(color, WHITE) and (inputs.alphas[~masks] == 1).all()
+    assert (inputs.alphas[masks] == 0).float().mean() > 0.5
+
+
 def test_a_place_is_no_object():
     for seed, places in ((0, "outdoors"), (1, "rooms")):
         scene = ProceduralScene(seed, SIZE, SIZE, num_images=16, places=places)

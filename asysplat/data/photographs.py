@@ -191,13 +191,15 @@ def with_background(
         say(f"object: {share:.0%} of the pixels are {name} behind it (masks=, background=)")
         return inputs.over(white, color), targets.over(white, color), color
     inputs, targets = (replace(views, alphas=None) for views in (inputs, targets))
-    if background == "auto" and inputs.masks is None:
+    if background == "auto":
         found = find_background(inputs.images)
         if found is not None:
             color, alphas = found
             share = 1 - alphas.mean().item()
             name = color_name(color)
             say(f"object: {share:.0%} of the pixels are {name} around it (background=)")
+            if inputs.masks is not None:
+                alphas = alphas.where(inputs.masks, 1)
             inputs = replace(inputs, alphas=alphas)
     return inputs, targets, inputs.mean_color() if color is None else color
 
