@@ -329,6 +329,7 @@ def run_folder(tmp_path):
 
 def test_only_what_describes_the_photographs_is_taken_from_a_run(run_folder, script):
     stored = {"path": "scene", "height": 300, "views": 7, "frames": 9, "seed": 5, "seconds": 600}
+    stored["background"] = [0.0, 0.5, 0.0]
     stored |= {"paths": {"run": "elsewhere"}, "checkpoint": "x", "video": {"path": "orbit"}}
     folder = run_folder(stored)
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -342,6 +343,7 @@ def test_only_what_describes_the_photographs_is_taken_from_a_run(run_folder, scr
         continued = script.continue_run(config, given)
         assert (continued.height, continued.views, continued.frames) == (height, views, 9)
         assert (continued.path, continued.width) == ("scene", None)
+        assert continued.background == [0.0, 0.5, 0.0]
         assert continued.init == str(folder / "scene.safetensors")
         assert continued.refinement.half_resolution_until == 0
         for key in ("seed", "seconds", "paths", "checkpoint", "video"):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 
-RING = 0.02  # width of the border that is looked at, over the shorter side
+RING = 0.02  # width of the ring of border pixels, over the shorter side
 MIN_BORDER = 0.9  # fraction of a border that shows the background
 MIN_VIEWS = 0.8  # fraction of the photographs whose borders do
 NOISE = 4.0  # tolerance, in median deviations of the borders from their colors

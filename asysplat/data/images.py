@@ -143,9 +143,10 @@ def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
 
 
 def load_reduced(path: ImageFile, least: int) -> UInt8[ndarray, "h w 3"]:
-    """Read an image as `load_image`, a JPEG at 1/2, 1/4 or 1/8 of its size, which takes less time.
+    """Read an image as `load_image`, but a JPEG at 1/8, 1/4 or 1/2 of its size, if that is enough.
 
-    If both sides then have at least `least` pixels, and divide without a rest.
+    Decoding takes less time then. The first fraction is taken that leaves both sides a whole number
+    of at least `least` pixels.
     """
 
     def read(image: OpenedImage) -> UInt8[ndarray, "h w 3"]:

@@ -15,9 +15,8 @@ from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import Verdict, diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.readers import open_scene
-from asysplat.data.readers.additions import MasksOf
 from asysplat.data.selection import evenly_spaced
-from asysplat.data.sequence import FileSequence, Points, PosedScene, SceneOptions
+from asysplat.data.sequence import FileSequence, MasksOf, Points, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.ranges import AtLeastTwo, Count, check_options
 from asysplat.scene import Cameras, Views

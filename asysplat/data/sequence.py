@@ -36,6 +36,7 @@ FAR = 100.0
 OVERSAMPLING = 4  # least pixels along a side from which one of a view is computed
 MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
 Points = Float[ndarray, "P 3"]
+MasksOf = Literal["auto", "object", "ignore"]
 
 
 @runtime_checkable
@@ -79,7 +80,7 @@ class SceneOptions:
     width: int
     layout: str = "auto"
     on_error: Policy = "fail"
-    masks: Literal["auto", "object", "ignore"] = "auto"
+    masks: MasksOf = "auto"
     cache: ImageCache | None = None
     disparities: Path | str | None = None
 

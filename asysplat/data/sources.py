@@ -134,7 +134,7 @@ class FilesSource:
     index: str | None = None
     val_scenes: int = 8
     targets_may_be_inputs: bool = False  # in training
-    first_window: Sequence[int] | None = None  # of the first task; None: `window`
+    first_window: Sequence[int] | None = None  # window of the first task; None: `window`
 
     def __post_init__(self):
         self.split_by_scenes = self.test_root is not None

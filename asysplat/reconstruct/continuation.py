@@ -30,7 +30,7 @@ def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     if not isinstance(taken.get("path"), str):
         raise InputError(f"{file} has no path of photographs: name the folder of a reconstruction.")
     for key, value in taken.items():
-        if not isinstance(value, str | int | None):
+        if key != "background" and not isinstance(value, str | int | None):  # that may be a list
             raise InputError(f"{file}: {key} is {value}: expected a word or a whole number.")
     taken |= {"run": str(folder), "init": str(folder / SCENE)}
     taken |= {"refinement.half_resolution_until": 0.0}

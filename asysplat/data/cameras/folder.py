@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.images import HEIF, image_size, load_mask
-from asysplat.data.readers.additions import FOLDERS
+from asysplat.data.readers.additions import MASKS
 from asysplat.data.readers.common import check_map_size
 from asysplat.files import check_room, make_folder
 
 ERRORS = "errors.json"  # file of the errors of refined cameras
-KEPT = ("images", FOLDERS[0], ERRORS)
+KEPT = ("images", MASKS, ERRORS)
 JPEG_QUALITY = 95
 BYTES_PER_PHOTOGRAPH = 10_000_000  # features and matches take up to 4 MB, and a copy as much
 ONLY_FATAL = 3  # the least severe messages that are printed
@@ -82,7 +82,7 @@ def save_mask(mask: Path | None, image: Path) -> None:
         return
     size = image_size(image)
     kept = Image.fromarray(load_mask(check_map_size(mask, size, str(image))))
-    target = image.parents[1] / FOLDERS[0] / f"{image.name}.png"
+    target = image.parents[1] / MASKS / f"{image.name}.png"
     target.parent.mkdir(exist_ok=True)
     kept.resize(size, Image.Resampling.NEAREST).convert("L").save(target)
 

@@ -35,7 +35,7 @@ Keypoints = tuple[Float32[ndarray, "_ 2"], Float32[ndarray, "_ 128"]]
 class Matches:
     """Points matched between two images, one pair of images after the other."""
 
-    indices: Int[Tensor, "M 2"]  # of the two images
+    indices: Int[Tensor, "M 2"]  # numbers of the two images
     points: Float[Tensor, "M 2 2"]  # x, y in both, in pixels, the first pixel's center at +0.5
 
     def __len__(self) -> int:

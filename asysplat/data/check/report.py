@@ -63,7 +63,7 @@ class Verdict:
 
     fits: bool  # whether the cameras as read fit the images
     summary: str  # the same in words; if they do not fit, the reason and what to do
-    fit: Fit | None = None  # of the cameras as read; None with too few matches
+    fit: Fit | None = None  # fit of the cameras as read; None with too few matches
 
 
 def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:

@@ -25,7 +25,7 @@ class FloorPlan:
 
     walk: Float[np.ndarray, "T 2"]  # camera positions from above; objects keep clear of them
     light: np.ndarray  # position of the lamp or sun
-    irradiance: np.ndarray  # of a surface that faces the light from close by
+    irradiance: np.ndarray  # irradiance of a surface that faces the light from close by
     falloff: float  # distance at which the light is half as strong
     ambient: np.ndarray  # light from all directions
     shell: list[Material]  # walls at +-x, +-y, ceiling and floor; outdoors the ground

@@ -34,9 +34,9 @@ from asysplat.data.readers import (
     scannetpp_depths,
     transforms,
 )
-from asysplat.data.readers.additions import MasksOf, with_faces, with_masks
+from asysplat.data.readers.additions import with_faces, with_masks
 from asysplat.data.readers.common import SUFFIXES, file_errors, images_in, natural_order
-from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
+from asysplat.data.sequence import FileSequence, MasksOf, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.files import check_exists
 

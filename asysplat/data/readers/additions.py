@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from PIL import Image
@@ -12,11 +11,11 @@ from PIL import Image
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import PANORAMA, Lens, has_alpha, load_alpha, same_proportions
 from asysplat.data.readers.common import check_map_size
-from asysplat.data.sequence import PosedImage, PosedScene
+from asysplat.data.sequence import MasksOf, PosedImage, PosedScene
 from asysplat.errors import InputError
 
-FOLDERS = ("masks", "mask", "images_mask")
-MasksOf = Literal["auto", "object", "ignore"]
+MASKS = "masks"
+FOLDERS = (MASKS, "mask", "images_mask")
 REMOVE_BG = "-removebg-preview.png"  # what remove.bg adds to a name
 DECIDING = 8  # masks, at most, that decide whether they are of an object
 BORDER_SIDE = 64  # pixels to which a mask is shrunk to look at its border

@@ -24,6 +24,7 @@ from asysplat.scene import MAX_FIELD_OF_VIEW, ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg", *HEIF)
+HALF_A_PIXEL = 0.5  # to be added to principal points where the first pixel's center is at 0
 MILLIMETERS = 0.001  # meters: the usual unit of stored depths
 
 

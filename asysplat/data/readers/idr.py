@@ -15,6 +15,7 @@ import numpy as np
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.common import (
+    HALF_A_PIXEL,
     check_map_size,
     check_rigid,
     folders_with,
@@ -24,7 +25,6 @@ from asysplat.data.readers.common import (
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
-HALF_A_PIXEL = 0.5  # IDR puts the first pixel's center at 0
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 

@@ -12,12 +12,10 @@ import numpy as np
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import check_rigid, invert_pose, scale_lens
+from asysplat.data.readers.common import HALF_A_PIXEL, check_rigid, invert_pose, scale_lens
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.files import read_text
-
-HALF_A_PIXEL = 0.5
 
 
 def find_scenes(root: Path) -> list[Path]:

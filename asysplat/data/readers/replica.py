@@ -13,14 +13,19 @@ import numpy as np
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import check_map_size, check_rigid, folders_with, scale_lens
+from asysplat.data.readers.common import (
+    HALF_A_PIXEL,
+    check_map_size,
+    check_rigid,
+    folders_with,
+    scale_lens,
+)
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.files import read_json, read_text
 
 TRAJECTORY = "traj.txt"
 PARAMETERS = "cam_params.json"
-HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's center at 0
 
 
 def find_scenes(root: Path) -> list[Path]:

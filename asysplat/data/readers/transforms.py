@@ -25,7 +25,6 @@ from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # read as OPENCV
-SUFFIXES = (".png", ".jpg", ".jpeg")
 DISTORTIONS = {  # names of the parameters of the others, in COLMAP's order
     "OPENCV": "k1 k2 p1 p2",
     "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6",
@@ -114,8 +113,8 @@ def _find_image(folder: Path, named: Path) -> Path:
     It is then in the folder of the same name, or in `folder`, perhaps saved in another format.
     """
     places = (named.parent, folder / named.parent.name, folder)
-    names = [named.name, *(f"{named.name}{suffix}" for suffix in SUFFIXES)]
-    names += [f"{named.stem}{suffix}" for suffix in SUFFIXES]
+    names = [named.name, *(f"{named.name}{suffix}" for suffix in common.SUFFIXES)]
+    names += [f"{named.stem}{suffix}" for suffix in common.SUFFIXES]
     paths = (place / name for place in places for name in names)
     return next((path for path in paths if path.is_file()), named)
 

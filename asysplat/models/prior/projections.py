@@ -24,7 +24,7 @@ class PairwiseProjections:
     """The projections between all pairs of views, for images of any size."""
 
     normalized: Float[Tensor, "B V V 3 4"]  # for images of width and height 1; see `matrices`
-    dtype: torch.dtype  # of the cameras
+    dtype: torch.dtype  # type of the cameras' numbers
 
     @classmethod
     def from_cameras(cls, cameras: Cameras) -> "PairwiseProjections":

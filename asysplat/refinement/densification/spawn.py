@@ -29,7 +29,7 @@ class ErrorDensifier(Densifier):
         fields: Fields,
         generator: torch.Generator,
         background: Float[Tensor, "3"],
-        units: Callable[[Tensor], Tensor],  # of the offsets at positions, see `Fields`
+        units: Callable[[Tensor], Tensor],  # units of the offsets at positions, see `Fields`
     ):
         self.fields, self.generator, self.background = fields, generator, background
         self.units, self._steps = units, 0

@@ -223,7 +223,7 @@ def head_gradients(
     decays,
     scores,
     states,  # before each chunk
-    grad_states,  # of the states after each chunk
+    grad_states,  # gradients of the states after each chunk
     grad_x,
     grad_dt,
     grad_A,  # [B, chunks, H], to be summed over sequences and chunks, like grad_D
