@@ -22,6 +22,7 @@ EXTRAS = {
     "viewer": "asysplat view, view=true",
     "video": "videos, in and out",
     "heif": "photographs as phones save them",
+    "masks": "masks=find",
     "spz": "SPZ of version 4",
     "sweeps": "sweeps on several processes, or on SLURM",
     "disparity": "python -m asysplat.data.disparity",

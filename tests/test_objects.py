@@ -1,16 +1,21 @@
 """Objects before a background: known by alpha, or found; nothing is left outside of them."""
 
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from asysplat import Gaussians, open_photographs, refine, render
 from asysplat.data import ProceduralScene
 from asysplat.data.background import find_background
-from asysplat.data.photographs import with_background
+from asysplat.data.photographs import RANGES, with_background
+from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
+from asysplat.ranges import check_options
 from asysplat.refinement.hull import is_outside
 from asysplat.refinement.init import initial_gaussians
 from asysplat.refinement.settings import DEFAULT
@@ -130,3 +135,53 @@ def test_the_background_may_be_chosen(views):
             InputError, match=r"background=.*: give auto, mean, white, black, or red"
         ):
             with_background(views, views, wrong, said.append)
+
+
+class LeftHalf:
+    """Session of a network that finds an object in the left half of every photograph."""
+
+    def __init__(self, path, providers):
+        assert path.endswith("u2netp.onnx")
+
+    def get_inputs(self):
+        return [SimpleNamespace(name="image")]
+
+    def run(self, _, inputs):
+        assert inputs["image"].shape == (1, 3, 320, 320) and inputs["image"].dtype == np.float32
+        assert abs(inputs["image"]).max() < 3  # as ImageNet is normalized
+        found = np.full((1, 1, 320, 320), -1.0, dtype=np.float32)
+        found[..., :160] = 3.0
+        return [found]
+
+
+def test_a_network_finds_the_object_of_photographs_without_masks(tmp_path, monkeypatch):
+    scene = ProceduralScene(seed=7, height=24, width=32, num_images=10).views(range(10))
+    folder, said = tmp_path / "scene", []
+    write_transforms(scene, folder)
+    with pytest.raises(InputError, match=r"masks=fnd should be 'auto', .* or 'find'"):
+        check_options({"masks": "fnd"}, RANGES)
+    (tmp_path / "rembg").mkdir()
+    for name in ("__init__.py", "u2netp.onnx"):
+        (tmp_path / "rembg" / name).touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match=r"masks=find needs .*: pip install 'asysplat\[masks\]'"):
+        open_photographs("a scene that is not looked for", height=24, masks="find")
+    monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(InferenceSession=LeftHalf))
+    options = {"height": 24, "background": "black", "say": said.append}
+    found = open_photographs(folder, masks="find", **options)
+    plain = open_photographs(folder, masks="auto", **options)
+    assert said[0] == "object: 50% of the pixels are black behind it (masks=, background=)"
+    for views, before in ((found.inputs, plain.inputs), (found.held_out, plain.held_out)):
+        assert views.alphas.shape == (len(before.images), 24, 32)
+        assert (views.alphas[..., :15] == 1).all() and (views.alphas[..., 17:] == 0).all()
+        torch.testing.assert_close(views.images[..., :15], before.images[..., :15])
+        assert (views.images[..., 17:] == 0).all()
+    for top in (255, 0):  # opaque, as some PNG are; and transparent, which needs no network
+        for file in (folder / "images").iterdir():
+            image = Image.open(file).convert("RGBA")
+            image.paste((0, 0, 0, top), (0, 0, 32, 12))
+            image.save(file)
+        alphas = open_photographs(folder, masks="find", **options).inputs.alphas
+        kept = alphas[:, :12, :15].mean(), alphas[:, 13:, 17:].mean()
+        assert kept == ((1, 0) if top else (0, 1))

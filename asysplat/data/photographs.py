@@ -31,6 +31,7 @@ RANGES = {
     "views": AtLeastTwo | None,
     "held_out_every": AtLeastTwo | None,
     "max_held_out": Count,
+    "masks": MasksOf,
 }
 GIVEN = CameraOptions()
 
@@ -107,7 +108,8 @@ def open_photographs(
         cameras: choice of given, refined or found cameras.
         held_out_every: hold out every n-th photograph, from the first on, or those that the data
             set holds out, if it names some; None: none.
-        masks: whether masks are of an "object", or of what to "ignore"; "auto": see `with_masks`.
+        masks: whether masks are of an "object", or of what to "ignore"; "auto": see `with_masks`;
+            "find": without masks of an object, a network finds it, see `load_object_finder`.
         background: color behind an object; see `with_background`.
         say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
 
@@ -122,8 +124,13 @@ def open_photographs(
         >>> len(photographs.held_out_files)
         4
     """
-    counts = (height, width, views, held_out_every, max_held_out)
-    check_options(dict(zip(RANGES, counts, strict=True)), RANGES)
+    options = (height, width, views, held_out_every, max_held_out, masks)
+    check_options(dict(zip(RANGES, options, strict=True)), RANGES)
+    find_object = None
+    if masks == "find":
+        from asysplat.data.find_masks import load_object_finder
+
+        find_object = load_object_finder()
     if found := find_missing(path, layout, on_error, cameras):
         say(f"cameras: found, see {found}")
         path, layout = found, "auto"
@@ -152,7 +159,9 @@ def open_photographs(
     if not found:
         scene = _with_chosen_cameras(scene, sorted((*inputs, *held_out)), cameras, say)
     sequence = FileSequence(scene, SceneOptions(height, width))
-    both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
+    both = [sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1])]
+    if find_object is not None and not _transparent_share(both[0]):
+        both = [find_object(views) for views in both]
     input_views, targets, normalization = normalize(*both)
     input_views, targets, color = with_background(input_views, targets, background, say)
     files = [str(image.file) for image in scene.images]
@@ -182,10 +191,9 @@ def with_background(
     """
     white = torch.ones(3)
     color = None if background in ("auto", "mean") else read_color(background)
-    if inputs.alphas is not None and bool((inputs.alphas < 0.5).any()):
+    if share := _transparent_share(inputs):
         if color is None:
             color = white if background == "auto" else inputs.mean_color()
-        share = (inputs.alphas < 0.5).float().mean().item()
         name = color_name(color)
         say(f"object: {share:.0%} of the pixels are {name} behind it (masks=, background=)")
         return inputs.over(white, color), targets.over(white, color), color
@@ -201,6 +209,10 @@ def with_background(
                 alphas = alphas.where(inputs.masks, 1)
             inputs = replace(inputs, alphas=alphas)
     return inputs, targets, inputs.mean_color() if color is None else color
+
+
+def _transparent_share(views: Views) -> float:
+    return 0.0 if views.alphas is None else (views.alphas < 0.5).float().mean().item()
 
 
 def _with_chosen_cameras(

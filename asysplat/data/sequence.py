@@ -36,7 +36,7 @@ FAR = 100.0
 OVERSAMPLING = 4  # least pixels along a side from which one of a view is computed
 MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
 Points = Float[ndarray, "P 3"]
-MasksOf = Literal["auto", "object", "ignore"]
+MasksOf = Literal["auto", "object", "ignore", "find"]
 
 
 @runtime_checkable

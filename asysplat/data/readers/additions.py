@@ -27,8 +27,8 @@ def with_masks(scene: PosedScene, bad: BadImages, masks: MasksOf = "auto") -> Po
 
     Masks that the files of a scene name themselves stay. Errors of single images are collected.
     `masks` says whether they are of an object, and where they are 0 there is nothing, or what they
-    leave out is to be ignored; "auto" takes them for an object's if most borders are left out.
-    Transparent photographs are of an object.
+    leave out is to be ignored; "auto" and "find" take them for an object's if most leave out the
+    borders. Transparent photographs are of an object.
     """
 
     def read(image: PosedImage) -> PosedImage:
@@ -41,7 +41,7 @@ def with_masks(scene: PosedScene, bad: BadImages, masks: MasksOf = "auto") -> Po
 
     images = bad.read_each(read, ((image,) for image in scene.images))
     separate = [image.mask for image in images if image.mask not in (None, image.file)]
-    if separate and (masks == "object" or (masks == "auto" and are_of_an_object(separate))):
+    if separate and masks != "ignore" and (masks == "object" or are_of_an_object(separate)):
         images = [replace(image, is_object=image.mask is not None) for image in images]
     return replace(scene, images=images)
 
