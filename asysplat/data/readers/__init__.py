@@ -28,6 +28,7 @@ from asysplat.data.readers import (
     long_lrm,
     middlebury,
     posed,
+    posediffusion,
     realestate10k,
     replica,
     scannetpp,
@@ -43,7 +44,7 @@ from asysplat.files import check_exists
 # In this order: the first layout that fits a folder reads it.
 READERS = (
     *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, blender, llff, posed, idr),
-    *(middlebury, colmap, scannetpp_depths),
+    *(middlebury, posediffusion, colmap, scannetpp_depths),
 )
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 

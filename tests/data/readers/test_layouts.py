@@ -79,6 +79,17 @@ def test_depths_may_be_smaller(name, few, tmp_path):
     assert opener(name)(scene).views([0]).depths.unique().tolist() == [2.125]
 
 
+def test_posediffusion_s_images_may_be_in_a_folder_and_each_has_a_camera(few, tmp_path):
+    import_module("layouts.posediffusion").write(few, tmp_path)
+    (tmp_path / "images").mkdir()
+    for file in tmp_path.glob("*.png"):
+        file.rename(tmp_path / "images" / file.name)
+    assert opener("posediffusion")(tmp_path).num_images == 4
+    (tmp_path / "images" / "frame000002.png").unlink()
+    with pytest.raises(InputError, match=r"gt_cameras.npz has 4 cameras for 3 images: give one"):
+        opener("posediffusion")(tmp_path)
+
+
 def test_images_that_blender_s_scenes_test_are_held_out(centered_views, tmp_path):
     write = import_module("layouts.blender").write
     alphas = torch.ones(12, 24, 32)
