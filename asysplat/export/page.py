@@ -38,6 +38,7 @@ def write_page(
     title: str = "",
     background: Sequence[int | float] = BLACK,
     antialiased: bool = False,
+    focus: Sequence[float] | None = None,
 ) -> None:
     """Write one scene and its viewer as one HTML file, which needs no server and no network.
 
@@ -51,6 +52,7 @@ def write_page(
         title: the page's title; empty: the file's name.
         background: RGB behind the Gaussians.
         antialiased: see `render`.
+        focus: the point to orbit; None: where the middle of the picture shows a surface.
 
     Raises:
         InputError: another suffix, invalid Gaussians or cameras, another number of names, a
@@ -85,6 +87,7 @@ def write_page(
         "path": _path(cameras),
         "names": [str(name) for name in names],
         "up": (HALF_TURN * mean_up(cameras).numpy()).tolist(),
+        "focus": None if focus is None else (HALF_TURN * focus).tolist(),
         "background": [float(value) for value in background],
         "defines": _defines(gaussians, antialiased),
     }

@@ -24,7 +24,7 @@ from asysplat.export import write_gaussians, write_page, write_video
 from asysplat.export.gaussians import CAMERAS, NO_NOTES, WRITERS, Notes
 from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, check_writable, new_folder
-from asysplat.reconstruct.video import check_video, video_cameras
+from asysplat.reconstruct.video import check_video, object_center, video_cameras
 from asysplat.refinement import AnchorScene, RefinementProgress
 from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import PICTURE, SCENE
@@ -92,7 +92,9 @@ class Results:
                 photographs.inputs.cameras.to("cpu")
             )
             names = [Path(file).name for file in photographs.input_files]
-            write_page(path, world, cameras, names, Path(self._config.path).name, background)
+            title, center = Path(self._config.path).name, object_center(world, photographs.inputs)
+            focus = None if center is None else center.tolist()
+            write_page(path, world, cameras, names, title, background, focus=focus)
 
     def save(self, scene: Gaussians | AnchorScene, progress: RefinementProgress) -> None:
         """Write the scene files, then cameras, the configuration, a contact sheet and metrics."""

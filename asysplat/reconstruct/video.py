@@ -17,7 +17,7 @@ from asysplat.export import orbit, smoothed_path
 from asysplat.ranges import Positive, check_options
 from asysplat.refinement import AnchorScene
 from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians
+from asysplat.scene import Cameras, Gaussians, Views
 
 MAX_HEIGHT = 4320  # pixels of 8K, the most that decoders of H.264 take
 CameraPath = Literal["own", "orbit", "none"]
@@ -67,8 +67,8 @@ def video_cameras(
         find_views(video, photographs.input_files, photographs.held_out_files)
     )
     if video.path == "orbit" and isinstance(scene, Gaussians):
-        is_object = photographs.inputs.alphas is not None
-        focus = scene.means.median(0).values if is_object else subject(scene, cameras)
+        focus = object_center(scene, photographs.inputs)
+        focus = subject(scene, cameras) if focus is None else focus
         path = orbit(cameras, frames, focus, scene)
     else:
         path = smoothed_path(cameras, frames, as_given=video.path != "own")
@@ -76,6 +76,11 @@ def video_cameras(
         return path
     width = video.height * path.width / path.height
     return path.resized(*(max(2, 2 * round(side / 2)) for side in (video.height, width)))
+
+
+def object_center(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "3"] | None:
+    """Compute the median of the means of an object; None if the inputs show a place."""
+    return None if inputs.alphas is None else gaussians.means.median(0).values
 
 
 @torch.no_grad()

@@ -50,7 +50,7 @@ class Elements(HTMLParser):
 
 def test_a_page_has_all_that_it_needs(scene, tmp_path):
     gaussians, cameras = scene
-    write_page(tmp_path / "scene.html", gaussians, cameras)
+    write_page(tmp_path / "scene.html", gaussians, cameras, focus=[1.0, 2.0, 3.5])
     text = (tmp_path / "scene.html").read_text(encoding="utf-8")
     elements = Elements(text)
     assert not [a for _, a, _ in elements.all if a.keys() & {"src", "href", "srcset", "action"}]
@@ -61,6 +61,7 @@ def test_a_page_has_all_that_it_needs(scene, tmp_path):
     settings = json.loads(elements.text("settings"))
     assert settings["image"] == [WIDTH, HEIGHT]
     assert [len(camera) for camera in settings["path"]] == [11] * 3
+    assert settings["focus"] == [1, -2, -3.5]  # in SPZ's axes
     policy = next(a["content"] for _, a, _ in elements.all if "http-equiv" in a)
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "unsafe" not in policy
@@ -250,6 +251,21 @@ def test_pointers_and_keys_move_the_camera(tab):
     for code, axis, sign in (("KeyD", 0, 1), ("KeyE", 1, -1), ("ArrowUp", 2, 1)):
         offset, _ = moved(lambda code=code: press(code))
         assert sign * offset[axis] > 0 and abs(np.delete(offset, axis)).max() < 1e-6
+
+
+@pytest.mark.medium
+def test_dragging_orbits_the_focus(browser, scene, tmp_path):
+    gaussians, cameras = scene
+    focus = cameras.centers[0] + cameras.cam_to_world[0, :3, :3] @ torch.tensor([0.5, 0.2, 3.0])
+    write_page(tmp_path / "scene.html", gaussians, cameras, focus=focus.tolist())
+    tab = browser.open(tmp_path / "scene.html", 320, 200)
+    tab.evaluate("asysplat.ready")
+    before, axes = camera(tab)
+    drag(tab, 40, 20, button="left", buttons=1)
+    after, axes_after = camera(tab)
+    assert np.linalg.norm(after - before) > 0.1
+    focus = focus.numpy() * [1, -1, -1]
+    np.testing.assert_allclose(axes_after @ (focus - after), axes @ (focus - before), atol=1e-4)
 
 
 @pytest.mark.medium

@@ -12,7 +12,7 @@ const KEYS = {
 const element = (id) => document.getElementById(id);
 const [canvas, slider] = [element("canvas"), element("slider")];
 const settings = JSON.parse(element("settings").textContent);
-const { path, names, up, image } = settings;
+const { path, names, up, focus, image } = settings;
 const held = new Set(), pointers = new Map(); // keys; the last event of each finger or mouse
 let scene, renderer, worker;
 let camera, sorted; // the shown one, and that of the order; replaced, never changed
@@ -95,7 +95,7 @@ function show(next) {
   slider.value = place = Math.min(Math.max(next, 0), path.length - 1);
   const nearest = Math.round(place);
   element("name").textContent = names[nearest] ?? `${nearest + 1} / ${path.length}`;
-  center = null;
+  center = focus;
   setCamera(cameraAt(path, place));
 }
 
@@ -106,7 +106,7 @@ function play(on) {
   request();
 }
 
-/** Return the point to orbit: at first at the median depth of the image. */
+/** Return the point to orbit: at first the focus, else at the median depth of the image. */
 function pivot() {
   const depths = center ? [] : renderer.depthMap(camera).depths.filter((depth) => depth > 0).sort();
   return center ??= move(camera, [0, 0, depths[depths.length >> 1] ?? 1]).position;
