@@ -80,7 +80,8 @@ def reconstruct(config: DictConfig) -> None:
     gaussians = initialize(config, photographs, settings)
     background = photographs.background
     results.save_start(gaussians, photographs, background)
-    with RefinementDisplay(Viewer(photographs.inputs) if config.view else None) as display:
+    viewer = Viewer(photographs.inputs, background=background.tolist()) if config.view else None
+    with RefinementDisplay(viewer) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}
         if per_view:
             anchors = refine_scaffold(gaussians, photographs.inputs, settings, **options)

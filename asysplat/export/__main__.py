@@ -39,7 +39,7 @@ from asysplat.export.gaussians import (
     write_gaussians,
 )
 from asysplat.export.importance import most_important, picture_psnr
-from asysplat.export.page import BLACK, PAGE, write_page
+from asysplat.export.page import PAGE, write_page
 from asysplat.interrupts import handle_signals
 
 
@@ -67,8 +67,7 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
     if cameras is not None and output.suffix.lower() == PAGE:
-        look = {"background": notes.background or BLACK, "antialiased": notes.antialiased}
-        write_page(output, written, cameras, names_beside(scene), **look)
+        write_page(output, written, cameras, names_beside(scene), **notes.look)
     else:
         write_gaussians(output, written, notes)
     print(f"{output}: {written.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.2f} MB")

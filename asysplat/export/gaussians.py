@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -35,6 +35,11 @@ class Notes(NamedTuple):
     background: Sequence[float] = ()
     antialiased: bool = False
 
+    @property
+    def look(self) -> dict[str, Any]:
+        """The options of pages and viewers."""
+        return {"background": self.background or BLACK, "antialiased": self.antialiased}
+
 
 NO_NOTES = Notes()
 READERS = {
@@ -56,13 +61,7 @@ WRITERS = {
     ".glb": lambda path, scene, _: write_glb(path, scene),
     ".splat": lambda path, scene, _: write_splat(path, scene),
     ".safetensors": lambda path, scene, notes: write_safetensors(path, scene, _metadata(notes)),
-    PAGE: lambda path, scene, notes: write_page(
-        path,
-        scene,
-        camera_before(scene),
-        background=notes.background or BLACK,
-        antialiased=notes.antialiased,
-    ),
+    PAGE: lambda path, scene, notes: write_page(path, scene, camera_before(scene), **notes.look),
 }
 
 

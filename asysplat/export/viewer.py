@@ -15,7 +15,7 @@ import math
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,6 +35,7 @@ from asysplat.data.photographs import open_photographs
 from asysplat.errors import InputError
 from asysplat.export import viewer_cameras
 from asysplat.export.gaussians import camera_before, cameras_beside, read_gaussians, read_notes
+from asysplat.export.page import BLACK
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views, inverse_depths
@@ -74,6 +75,7 @@ class Viewer:
         views: input views, [V]; of images of one pixel, frames alone are drawn.
         gaussians: [N]; None to `show` them later.
         port: the next free one is used if it is taken; 0: any free one.
+        background: RGB behind the Gaussians.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class Viewer:
         gaussians: Gaussians | None = None,
         port: int = 8080,
         antialiased: bool = False,
+        background: Sequence[float] = BLACK,
     ):
         try:
             import viser
@@ -93,7 +96,7 @@ class Viewer:
         views = Views(views.cameras, views.images).to("cpu")
         # A browser's near plane, navigation and float32 suit a scene of about size 1 only.
         views, _, self._frame = normalize(views, views)
-        self._cameras = views.cameras
+        self._cameras, self._background = views.cameras, background
         self._up = viewer_cameras.mean_up(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._version = object()
@@ -259,13 +262,14 @@ class Viewer:
         return in_full
 
     def _options(self) -> dict[str, Any]:
-        """Return the panel's options of `draw_layer`, valid whatever a page has sent."""
+        """Return the options of `draw_layer`, valid whatever a page has sent."""
         return {
             "layer": self._layer.value if self._layer.value in LAYERS else LAYERS[0],
             "sh_degree": round(_bounded(self._sh_degree)),
             "min_opacity": _bounded(self._min_opacity),
             "size": _bounded(self._size),
             "antialiased": self._antialiased.value,
+            "background": self._background,
         }
 
 
@@ -292,12 +296,14 @@ def draw_layer(
     min_opacity: float = 0.0,
     size: float = 1.0,
     antialiased: bool = False,
+    background: Sequence[float] = BLACK,
 ) -> UInt8[ndarray, "H W 3"]:
     """Render one of LAYERS as colors, depths as disparities; `size` is a factor of the scales."""
     opacities = gaussians.opacities.where(gaussians.opacities >= min_opacity, 0)
     gaussians = replace(gaussians, scales=size * gaussians.scales, opacities=opacities)
     options = {"sh_degree": sh_degree, "antialiased": antialiased, "depth": layer == "depth"}
-    rendering = render(gaussians, camera.to(gaussians.means.device), **options)
+    behind = gaussians.means.new_tensor(background)
+    rendering = render(gaussians, camera.to(behind.device), behind, **options)
     if layer == "depth":
         values = inverse_depths(rendering.depth[0])
         sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]
@@ -334,7 +340,7 @@ def main(scene: str, folder: str | None) -> None:
             gaussians = read_gaussians(scene)
             cameras = cameras_beside(Path(scene), gaussians) or camera_before(gaussians)
             views = Views(cameras.resized(1, 1), torch.zeros(cameras.num_views, 3, 1, 1))
-        with Viewer(views, gaussians, antialiased=read_notes(Path(scene)).antialiased) as viewer:
+        with Viewer(views, gaussians, **read_notes(Path(scene)).look) as viewer:
             print(f"viewer: {viewer.url}, until Ctrl-C")
             viewer.wait()
     except InputError as error:

@@ -17,6 +17,7 @@ import torch
 from asysplat import Views, write_gaussians
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
+from asysplat.export.gaussians import Notes
 from asysplat.export.viewer import LAYERS, MAX_PIXELS, Viewer, cameras_beside, draw_layer, main
 from asysplat.export.viewer_cameras import quaternion
 
@@ -261,7 +262,7 @@ def opened(monkeypatch):
 def file(scene, tmp_path):
     """A file of Gaussians, with their cameras beside it, the third first."""
     gaussians, views = scene
-    write_gaussians(tmp_path / "scene.ply", gaussians)
+    write_gaussians(tmp_path / "scene.ply", gaussians, Notes(background=(1.0, 0.5, 0.0)))
     cameras = views.cameras.select([2, 0, 1, 3])
     content = describe_cameras(cameras, [f"/absent/{view}.png" for view in range(4)])
     (tmp_path / "transforms.json").write_text(json.dumps(content))
@@ -281,6 +282,7 @@ def test_the_command_opens_at_the_first_camera_beside_the_scene_upright(scene, f
     assert torch.tensor(first.up).float() @ (turn @ pose[:, 1])[:3] < 0  # y is down
     assert first.fov == pytest.approx(2 * np.arctan(45 / 110))
     assert viewer._cameras.num_views == 4
+    assert viewer._options()["background"] == (1.0, 0.5, 0.0)
 
 
 def test_cameras_of_another_scene_are_a_line(scene, file, capsys):

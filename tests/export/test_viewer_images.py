@@ -87,8 +87,11 @@ def bytes_of(image):
 
 
 def test_color_and_alpha_are_those_of_the_renderer(scene):
-    rendering = render(*scene)
-    color, alpha = draw_layer(*scene), draw_layer(*scene, layer="alpha")
+    background = (0.0, 0.0, 1.0)
+    rendering = render(*scene, torch.tensor(background))
+    color, alpha = (
+        draw_layer(*scene, layer, background=background) for layer in ("color", "alpha")
+    )
     np.testing.assert_array_equal(color, bytes_of(rendering.image[0]).transpose(1, 2, 0))
     for channel in range(3):
         np.testing.assert_array_equal(alpha[..., channel], bytes_of(rendering.alpha[0]))
