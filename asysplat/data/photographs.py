@@ -145,8 +145,7 @@ def open_photographs(
         width = max(1, round(height * lens.width / lens.height))
     if views is None:
         views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
-    indices = range(len(scene.images))
-    published = [index for index in indices if scene.images[index].held_out]
+    indices, published = range(len(scene.images)), scene.held_out
     held_out = published or indices[::held_out_every] if held_out_every else []
     rest = sorted(set(indices) - set(held_out) - set(published))
     if len(rest) < 2:

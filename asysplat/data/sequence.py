@@ -125,6 +125,11 @@ class PosedScene:
     read_points: Callable[[], Points | None] | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @property
+    def held_out(self) -> list[int]:
+        """The indices of the images that the data set holds out."""
+        return [index for index, image in enumerate(self.images) if image.held_out]
+
     @cached_property
     def points(self) -> Points | None:
         """Sparse points, read at the first access: they may take longer than all the rest."""

@@ -118,7 +118,8 @@ class FilesSource:
     With a `test_root`, its scenes test, some scenes of `root` validate, and the others train with
     all their images; test scenes are never trained on, even if `root` holds them as well. Without a
     `test_root`, in every scene of `root` the first of every 8 images tests, the fifth validates,
-    and the others train.
+    and the others train. Of scenes whose data set holds out images, every_8th tests those, and the
+    fifth of every 8 others validates.
     """
 
     root: str  # one scene, or a folder of scenes, as test_root
@@ -173,7 +174,8 @@ class FilesSource:
             )
         sequence = self.training_folder[scenes[rng.integers(len(scenes))]]
         count = sequence.num_images
-        images = range(count) if self.split_by_scenes else training_images(count)
+        published = sequence.scene.held_out if self.selection == "every_8th" else ()
+        images = range(count) if self.split_by_scenes else training_images(count, published)
         window = grown_window(self.first_window, self.window, grown)
         both = self.targets_may_be_inputs
         drawn = training_selection(len(images), inputs, targets, window, rng, both)
@@ -185,9 +187,10 @@ class FilesSource:
             return self._index_tasks(self.index, inputs)
         selection = "every_8th" if self.selection == "index" else self.selection
         validated = (self.training_folder[scene] for scene in self._split[0])
+        options = inputs, targets, split
         return [
-            Task(sequence, named_selection(selection, sequence.cameras, inputs, targets, split))
-            for sequence in (self._tests if split == "test" else validated)
+            Task(scene, named_selection(selection, scene.cameras, *options, scene.scene.held_out))
+            for scene in (self._tests if split == "test" else validated)
         ]
 
     @cached_property

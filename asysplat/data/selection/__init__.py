@@ -37,9 +37,17 @@ class Selection:
 
 
 def named_selection(
-    selection: str, cameras: Cameras, num_inputs: int, num_targets: int, split: Split
+    selection: str,
+    cameras: Cameras,
+    num_inputs: int,
+    num_targets: int,
+    split: Split,
+    published: Sequence[int] = (),
 ) -> Selection:
-    """Select images of a scene with these cameras by one of the methods in SELECTIONS."""
+    """Select images of a scene with these cameras by one of the methods in SELECTIONS.
+
+    The images that its data set holds out, `published`, count in every_8th, see `held_out`.
+    """
     if selection not in SELECTIONS:
         raise InputError(
             f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."
@@ -48,8 +56,9 @@ def named_selection(
         return kmeans_selection(cameras, num_inputs, num_targets, split)
     if selection == "uniform":
         return uniform_selection(cameras.num_views, num_inputs, num_targets)
-    by_number = every_8th_selection if selection == "every_8th" else first_96_selection
-    return by_number(cameras.num_views, num_inputs, num_targets, split)
+    if selection == "first_96":
+        return first_96_selection(cameras.num_views, num_inputs, num_targets, split)
+    return every_8th_selection(cameras.num_views, num_inputs, num_targets, split, published)
 
 
 def uniform_selection(num_images: int, num_inputs: int, num_targets: int) -> Selection:
@@ -104,23 +113,34 @@ def grown_window(
     return shortest, longest
 
 
-def held_out(num_images: int, split: Split) -> list[int]:
-    """Return images 0, 8, 16, ... for test (paper, Suppl. A), 4, 12, 20, ... for val."""
-    return list(range(HELD_OUT_START[split], num_images, HELD_OUT_STEP))
+def held_out(num_images: int, split: Split, published: Sequence[int] = ()) -> list[int]:
+    """Return images 0, 8, 16, ... for test (paper, Suppl. A), 4, 12, 20, ... for val.
+
+    Where a data set holds out images, test has those, and val 4, 12, 20, ... of the others.
+    """
+    if published and split == "test":
+        return list(published)
+    others = sorted(set(range(num_images)) - set(published))
+    return others[HELD_OUT_START[split] :: HELD_OUT_STEP]
 
 
-def training_images(num_images: int) -> list[int]:
+def training_images(num_images: int, published: Sequence[int] = ()) -> list[int]:
     """Return the images that neither validation nor test holds out."""
-    out = held_out(num_images, "val") + held_out(num_images, "test")
+    out = held_out(num_images, "val", published) + held_out(num_images, "test", published)
     return sorted(set(range(num_images)) - set(out))
 
 
 def every_8th_selection(
-    num_images: int, num_inputs: int, num_targets: int, split: Split
+    num_images: int,
+    num_inputs: int,
+    num_targets: int,
+    split: Split,
+    published: Sequence[int] = (),
 ) -> Selection:
     """Select inputs evenly over the training images, at most `num_targets` held-out targets."""
-    images, targets = training_images(num_images), held_out(num_images, split)
-    check_held_out(num_images, len(images), num_inputs, split)
+    images = training_images(num_images, published)
+    targets = held_out(num_images, split, published)
+    check_held_out(num_images, images, targets, num_inputs, split)
     return Selection(
         evenly_spaced(images, num_inputs), evenly_spaced(targets, min(num_targets, len(targets)))
     )
@@ -134,7 +154,7 @@ def first_96_selection(
     Positions are truncated to whole ones, as in Long-LRM (data/dataset.py); the paper does not say.
     """
     images, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
-    check_held_out(num_images, len(images), num_inputs, split)
+    check_held_out(num_images, images, targets, num_inputs, split)
     positions = np.linspace(0, len(images) - 1, num_inputs, dtype=int)
     return Selection([images[position] for position in positions], targets)
 
@@ -157,11 +177,13 @@ def evenly_spaced(images: Sequence[int], count: int) -> list[int]:
     return [images[int(position + 0.5)] for position in positions]
 
 
-def check_held_out(num_images: int, num_candidates: int, num_inputs: int, split: Split) -> None:
-    """Check that there are targets, and enough candidates for the inputs."""
-    if num_candidates < num_inputs or not held_out(num_images, split):
+def check_held_out(
+    num_images: int, images: list[int], targets: list[int], num_inputs: int, split: Split
+) -> None:
+    """Check that there are targets, and enough images for the inputs."""
+    if len(images) < num_inputs or not targets:
         raise InputError(
-            f"The sequence has {num_images} images, of which {num_candidates} are not held out for "
+            f"The sequence has {num_images} images, of which {len(images)} are not held out for "
             f"{split}: set data.inputs to at most that, or give a longer sequence."
         )
 
@@ -185,7 +207,7 @@ def kmeans_selection(
 ) -> Selection:
     """Select as the paper's tests do: inputs by k-means on positions and viewing directions."""
     images, targets = paper_split(cameras.num_views, num_targets, split)
-    check_held_out(cameras.num_views, len(images), num_inputs, split)
+    check_held_out(cameras.num_views, images, targets, num_inputs, split)
     chosen = nearest_to_centers(pose_features(cameras.select(images)), num_inputs)
     return Selection([images[index] for index in chosen], targets)
 

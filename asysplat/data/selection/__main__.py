@@ -34,8 +34,8 @@ def main(arguments: list[str] | None = None) -> None:
             name = sequence.name
             if name in index:
                 raise InputError(f"{options.root} holds two scenes called {name}: rename one.")
-            counts = (options.inputs, options.targets)
-            index[name] = named_selection(options.selection, sequence.cameras, *counts, "test")
+            rest = (options.inputs, options.targets, "test", sequence.scene.held_out)
+            index[name] = named_selection(options.selection, sequence.cameras, *rest)
         write_index(options.index, index)
     except InputError as error:
         sys.exit(f"error: {error}")

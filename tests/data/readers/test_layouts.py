@@ -4,12 +4,14 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 import layouts
+import numpy as np
 import pytest
 import torch
 from layouts import assert_listed, assert_same, cut, opener, save_depth
 
 from asysplat import open_photographs
-from asysplat.data import find_scenes
+from asysplat.data import FilesSource, SceneOptions, find_scenes
+from asysplat.data.selection import Selection
 from asysplat.errors import InputError
 
 CUT = (".json", ".npy", ".npz", ".txt", ".bin", ".torch")  # files of cameras and points
@@ -104,3 +106,9 @@ def test_images_that_blender_s_scenes_test_are_held_out(centered_views, tmp_path
     assert (photographs.inputs.images[:, :, :8] == 1).all()
     alone = open_photographs(tmp_path, height=24, held_out_every=None, say=lambda text: None)
     assert alone.held_out is None and alone.inputs.num_views == 8
+    source = FilesSource(str(tmp_path), SceneOptions(24, 32), window=None)
+    (tested,), (validated,) = (source.evaluation(split, 4, 8) for split in ("test", "val"))
+    assert tested.selection == Selection([0, 2, 5, 7], [8, 9, 10, 11])
+    assert validated.selection == Selection([0, 2, 5, 7], [4])
+    trained = [source.training(3, 2, np.random.default_rng(seed)).selection for seed in range(20)]
+    assert {i for drawn in trained for i in drawn.inputs + drawn.targets} == {*range(8)} - {4}
