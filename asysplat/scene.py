@@ -310,6 +310,16 @@ class Views(TensorRecord):
         total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
         return (total / count).nan_to_num(0.5)
 
+    def color_behind(self, default: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Compute the mean color of the pixels that show the background alone; else `default`."""
+        if self.alphas is None:
+            return default
+        behind = self.alphas == 0
+        if self.masks is not None:
+            behind &= self.masks
+        shown = behind.flatten(-3).any(-1, keepdim=True)
+        return replace(self, masks=behind).mean_color().where(shown, default)
+
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
         """Copy the photographs into masked pixels, where they add no error or gradient."""
         if self.masks is None:

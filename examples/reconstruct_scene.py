@@ -20,11 +20,11 @@ def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
     photographs = open_photographs(folder, height=128, width=128, views=8)
     with torch.no_grad():
         start = load("shipped")(photographs.inputs)
-    gaussians = refine(start, photographs.inputs, seconds=10.0)
+    background = photographs.background
+    gaussians = refine(start, photographs.inputs, seconds=10.0, background=background)
     world = photographs.normalization.to_world(gaussians)  # the world of the files
     write_gaussians(scene, world)
 
-    background = photographs.inputs.mean_color()
     rendering = render(gaussians, photographs.held_out.cameras, background)
     comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(figure, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; figure: {figure}")

@@ -41,7 +41,9 @@ def test_it_draws_a_figure(run_example, tmp_path, capsys, name):
 @pytest.fixture
 def few_steps(monkeypatch):
     """A refinement of seconds takes a few steps."""
-    monkeypatch.setattr("asysplat.refine", lambda *given, seconds: refine(*given, steps=5))
+    monkeypatch.setattr(
+        "asysplat.refine", lambda *given, seconds, **more: refine(*given, steps=5, **more)
+    )
 
 
 @pytest.mark.medium

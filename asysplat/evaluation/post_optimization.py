@@ -58,7 +58,8 @@ class PostOptimization:
     steps: Sequence[int]  # after which to measure, increasing; 0: as predicted
     protocol: Protocol
     lpips: nn.Module | None
-    background: Float[Tensor, "3"] | None = None  # None: the mean color of the inputs
+    # None: what is behind an object in the inputs, else their mean color.
+    background: Float[Tensor, "3"] | None = None
     # By the names of scenes of which another one is known.
     backgrounds: Mapping[str, Float[Tensor, "3"]] = field(default_factory=dict)
 
@@ -80,12 +81,15 @@ class PostOptimization:
     ) -> SceneResult:
         """Measure one scene, without batch dimension; the costs do not include the metrics.
 
+        Transparent pixels of its views show the background that it is measured before.
+
         `watch` is called after each step with the number of steps and, at the steps to measure, the
         rendering of the targets.
         """
-        background = self.backgrounds.get(scene, self.background)
-        if background is None:
-            background = inputs.mean_color()
+        behind = inputs.color_behind(inputs.mean_color())
+        known = self.backgrounds.get(scene, self.background)
+        background = behind if known is None else known
+        inputs, targets = (views.over(behind, background) for views in (inputs, targets))
         result = SceneResult(scene)
         for method, rows in self.protocol.measure_baselines(inputs, targets, self.lpips).items():
             result.add("targets", method, rows)

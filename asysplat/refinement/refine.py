@@ -67,7 +67,7 @@ class Refinement:
     Args:
         gaussians: [N], initial values.
         views: the input views, [V].
-        background: RGB; None: the mean color of the views.
+        background: RGB; None: what the views show behind an object, else their mean color.
         settings: what is optimized, and how.
         seed: seed of the order of views and of new Gaussians.
     """
@@ -86,7 +86,8 @@ class Refinement:
         self.views = views.validate("refine's views")
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings = settings
-        self.background = views.mean_color() if background is None else background
+        behind = views.color_behind(views.mean_color())
+        self.background = behind if background is None else background
         self._generator = torch.Generator(gaussians.means.device).manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates, views.images.device)

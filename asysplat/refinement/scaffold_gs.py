@@ -338,7 +338,7 @@ def refine_scaffold(
         raise InputError("refine_scaffold got no Gaussians: start from at least one.")
     gaussians.validate("refine_scaffold's gaussians")
     views.validate("refine_scaffold's views")
-    color = views.mean_color() if background is None else background
+    color = views.color_behind(views.mean_color()) if background is None else background
     points = gaussians.means.detach().float()
     if seconds is not None:  # a step with few anchors compiles the kernels before the time runs
         ScaffoldRefinement(points[:10], views, color, settings, seed).advance(0.0)

@@ -30,9 +30,9 @@ class SplattingModule(lightning.LightningModule):
         optimizer: parameter groups -> optimizer; only `decaying` parameters have weight decay.
         matrix_optimizer: matrices -> optimizer, of `block_matrices`; None: as the others.
         schedule: optimizer -> its learning rates, one for each step.
-        background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input
-            views; in training black or white, whichever is less like that mean, so that
-            transparent Gaussians never lower the loss.
+        background: RGB in [0, 1] behind the Gaussians, or "inputs": what is behind an object in
+            the input views, else their mean color; in training, in place of that mean, black or
+            white, whichever is less like it, so that transparent Gaussians never lower the loss.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
         views_at_once: targets of each scene that are rendered at a time; None: all. See `render`.
         drop_above: drop a step whose gradient's norm is above this multiple of the trainer's
@@ -84,9 +84,9 @@ class SplattingModule(lightning.LightningModule):
         """Return the background of the targets: [3], or [B, V, 3] if it depends on the inputs."""
         if self.background is not None:
             return self.background
-        mean = batch["inputs"].mean_color()[:, None]
-        color = (mean < 0.5).to(mean) if self.training else mean
-        return color.expand(-1, batch["targets"].cameras.num_views, -1)
+        mean = batch["inputs"].mean_color()
+        color = batch["inputs"].color_behind((mean < 0.5).to(mean) if self.training else mean)
+        return color[:, None].expand(-1, batch["targets"].cameras.num_views, -1)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Compute the loss of a micro-batch; log the means of a step at its last micro-batch."""

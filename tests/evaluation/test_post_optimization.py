@@ -46,6 +46,20 @@ def test_intermediate_steps_equal_a_shorter_refinement(scene):
         assert found == PROTOCOL.psnr(image, targets).tolist(), steps
 
 
+def test_an_object_is_measured_before_its_background(scene):
+    """In every place one is chosen, transparent pixels show it."""
+    cameras = scene[2].cameras
+    true = replace(scene[0], scales=0.2 * scene[0].scales, sh=0.2 * scene[0].sh)
+    with torch.no_grad():
+        drawn = render(true, cameras, torch.ones(3))
+    views = Views(cameras, drawn.image.clamp(0, 1), alphas=drawn.alpha.clamp(0, 1))
+    assert (views.alphas == 0).any()
+    for background in (None, BLACK):
+        measure = PostOptimization((0,), PROTOCOL, None, background)
+        rows = measure("synthetic", lambda _: true, views, views).rows
+        assert all(row["psnr"] > 50 for row in rows if row["method"] == "post0")
+
+
 def test_costs_of_post_optimization_do_not_include_the_metrics(scene, monkeypatch):
     """On a clock that a prediction moves by 1, a step by 10 and a measurement by 100."""
     gaussians, inputs, targets = scene

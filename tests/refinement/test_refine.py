@@ -339,6 +339,8 @@ def test_the_background_is_the_mean_color_of_unmasked_pixels(threads):
     expected = (views.images[2, :, 7, 9] + views.images[0, :, 1, 1]) / 2
     torch.testing.assert_close(replace(views, masks=masks).mean_color(), expected)
     assert torch.equal(Refinement(small_scene(), views).background, mean)
+    behind = replace(views, alphas=1 - masks.float())
+    torch.testing.assert_close(Refinement(small_scene(), behind).background, expected)
     given = torch.tensor([1.0, 0, 0])
     assert torch.equal(Refinement(small_scene(), views, given).background, given)
 

@@ -1,6 +1,7 @@
 """Steps of the optimizer: which parameters decay or train, the learning rate, new tasks."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -105,6 +106,13 @@ def test_the_background_follows_the_inputs(build):
     prediction = module.eval()(batch, depth=False)
     expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
     torch.testing.assert_close(prediction.rendering.image, expected)
+    alphas = torch.ones(2, 2, 32, 32)
+    alphas[0, :, :4] = 0
+    inputs.images[0, :, :, :4] = 0.25
+    batch["inputs"] = replace(inputs, alphas=alphas)
+    assert (module(batch, depth=False).rendering.image[0] == 0.25).all()
+    trained = module.train()(batch, depth=False).rendering.image
+    assert (trained[0] == 0.25).all() and (trained[1] == 1).all()
 
 
 def rates(warmup_steps, total_steps, steps):
