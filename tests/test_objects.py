@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from PIL import Image
 
@@ -19,6 +20,7 @@ from asysplat.ranges import check_options
 from asysplat.refinement.hull import is_outside
 from asysplat.refinement.init import initial_gaussians
 from asysplat.refinement.settings import DEFAULT
+from asysplat.rendering import INRIA
 from asysplat.scene import Cameras, Views
 
 SIZE = 48
@@ -102,6 +104,17 @@ def test_masked_pixels_do_not_show_the_color(views):
     inputs, _, color = with_background(plain, plain, "auto", lambda text: None)
     assert torch.equal(color, WHITE) and (inputs.alphas[~masks] == 1).all()
     assert (inputs.alphas[masks] == 0).float().mean() > 0.5
+
+
+@pytest.mark.parametrize("prior", ["plane_sweep", "depth"])
+def test_networks_draw_nothing_at_pixels_of_the_background(views, build, prior):
+    scene = views.select(range(0, 16, 2)).map(lambda tensor: tensor[None])
+    with torch.no_grad():
+        found = build(*tiny.SIZE, f"model/prior={prior}").eval()(scene, prune=False)
+    opaque = torch.nn.functional.avg_pool2d(scene.alphas, 2).flatten() > 0.5
+    drawn = found.opacities[0] > INRIA.alpha_min
+    assert not drawn[~opaque].any()
+    assert drawn[opaque].float().mean() > 0.9
 
 
 def test_a_place_is_no_object():
