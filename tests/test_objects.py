@@ -64,6 +64,22 @@ def views(ball):
     return Views(cameras, drawn.image.clamp(0, 1), alphas=drawn.alpha).validate()
 
 
+def test_fog_of_the_backgrounds_color_fades(ball, views):
+    """A single view, which has no hull, tells it from the background in the steps before others."""
+    view, fog = views.select([0]), ball.map(lambda field: field[:300])
+    fog = replace(fog, means=2 * fog.means, sh=torch.full_like(fog.sh, 0.5 / 0.2820948))
+    start = Gaussians(
+        **{name: torch.cat((field, vars(fog)[name])) for name, field in vars(ball).items()}
+    )
+
+    def alpha(gaussians):
+        alphas = render(gaussians, view.cameras).alpha
+        return alphas[view.alphas == 0].mean()
+
+    refined = refine(start, view, replace(DEFAULT, densify="none"), steps=60, background=WHITE)
+    assert alpha(start) > 0.3 and alpha(refined) < 0.03
+
+
 def test_nothing_is_left_outside_the_hull(views):
     inputs = views.select(range(1, 16))
     start = initial_gaussians("plane_sweep", inputs, DEFAULT)

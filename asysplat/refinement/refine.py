@@ -129,7 +129,8 @@ class Refinement:
         factor = settings.final_lr_factor**cooled
         error, sums = 0.0, ()
         for view in chosen:
-            mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
+            target, background = self._before_background(views.select([view]))
+            mse, of_view = self._gradients(target, background, view, leaves, factor)
             self._densifier.observe_view(of_view[0], views.cameras.select([view]))
             sums = list(map(torch.add, sums, of_view)) if sums else of_view
             error += mse / len(chosen)
@@ -163,15 +164,30 @@ class Refinement:
         """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
         self.fields.reset_opacities(MAX_RESET_OPACITY)
 
+    def _before_background(self, view: Views) -> tuple[Views, Float[Tensor, "3"]]:
+        """Return a view and what is behind it: for an object, in every other step a random color.
+
+        Before one color alone, fog of that color would cost nothing around the object.
+        """
+        if view.alphas is None or self._steps % 2 == 0 or not self.settings.rates.opacities:
+            return view, self.background
+        color = torch.rand(3, generator=self._generator, device=view.images.device)
+        return view.over(self.background, color), color
+
     def _gradients(
-        self, target: Views, view: int, leaves: Parameters, factor: float
+        self,
+        target: Views,
+        background: Float[Tensor, "3"],
+        view: int,
+        leaves: Parameters,
+        factor: float,
     ) -> tuple[float, Sequence[Tensor]]:
         """Render a view and update its corrections; return its MSE and the leaves' gradients."""
         cameras, correction = target.cameras, self.corrections.leaves()
         if correction:
             cameras = correct_poses(cameras, correction["poses"][view, None])
         gaussians = self.fields.gaussians(leaves)
-        image = render(gaussians, cameras, self.background, depth=False, masks=target.masks).image
+        image = render(gaussians, cameras, background, depth=False, masks=target.masks).image
         if correction:
             image = correct_exposure(image, correction["exposure"][view, None])
         if self.settings.ssim is None:
