@@ -55,8 +55,7 @@ def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     data.setup()
     net = instantiate(config.model)
     module = instantiate(config.training, net=net)
-    early_exit = instantiate(config.speed)
-    stage.check(data, module, early_exit)
+    stage.check(data, net)
     stage.load(module)
     logger = instantiate_option(config, "logger")
     callbacks = instantiate(config.get("callbacks") or {})
@@ -66,7 +65,7 @@ def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     stage.begin(trainer, data)
     with stage.resuming(trainer):
         trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
-    net.early_exit = early_exit
+    net.early_exit = instantiate(config.speed)
     trainer.test(module, data, verbose=False)
     run.record(stage, trainer, callbacks)
 

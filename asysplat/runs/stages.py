@@ -37,19 +37,25 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
 
 
 def check_stages(stages: Sequence[DictConfig]) -> None:
-    """Check the options of every stage, so that none is refused after days of training."""
-    if len(stages) == 1:
-        check_training(stages[0])
-        return
+    """Check the options of every stage, before any scene is made and any step is taken."""
     for stage in stages:
+        data = stage.data
         try:
             check_training(stage)
             with torch.device("meta"):
                 net = instantiate(stage.model)
-            net.check_size(stage.data.height, stage.data.width)
-            net.check_views(stage.data.inputs)
+            net.check_early_exit(instantiate(stage.speed))
+            test_size = data.test_size if stage is stages[-1] else None  # that of all stages
+            for height, width in filter(None, ((data.height, data.width), test_size)):
+                net.check_size(height, width)
+                instantiate(stage.metrics).check_size(height, width)
+            net.check_views(data.inputs)
         except InputError as error:
+            if len(stages) == 1:
+                raise
             raise InputError(f"{stage.stage}: {error}") from error
+    if len(stages) == 1:
+        return
     if (stages[-1].get("callbacks") or {}).get("checkpoints") is None:
         raise InputError(
             "callbacks.checkpoints is left out, and each stage starts from the checkpoint of the "

@@ -22,7 +22,7 @@ from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError, brief, input_error_behind
-from asysplat.models.network import EarlyExit
+from asysplat.models.network import Network
 from asysplat.runs import checkpoints
 from asysplat.runs.machine import find_accelerator, revision
 from asysplat.runs.run_config import plain_options
@@ -52,12 +52,8 @@ class TrainingStage:
     def folder(self) -> Path:
         return Path(self.config.paths.run)
 
-    def check(
-        self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
-    ) -> None:
-        """Check that data, model and metrics fit each other."""
-        net = module.net
-        net.check_early_exit(early_exit)
+    def check(self, data: SceneDataModule, net: Network) -> None:
+        """Check that the test sets fit the model and the metrics."""
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
         data.check_sizes(instantiate(self.config.metrics).check_size)

@@ -9,6 +9,8 @@ from omegaconf import OmegaConf
 from asysplat.data.loader import split_batch
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
+from asysplat.runs.run_config import flat_options
+from asysplat.runs.runs import hashed_options
 from paper.tables import load_paper
 
 ROOT = Path(__file__).parents[2]
@@ -122,7 +124,7 @@ def test_commands_of_the_paper_compose_its_network(compose_train, command):
 def test_long_lrm_is_as_published(compose_train):
     """arthurhero/Long-LRM, configs/7m1t_tm.yaml and dl3dv_i540_32input_8target.yaml."""
     options = ["scale=paper", "data=dl3dv", *PLACES, "stage=stage3"]
-    config = compose_train(*options, "model=longlrm")
+    config = compose_train(*options, "model=longlrm", "recipe=own")
     loss = config.training.loss
     assert (loss.mse, loss.perceptual, loss.opacity, loss.depth) == (1.0, 1.0, 0.1, 0.01)
     assert loss.depth_term._target_ == "asysplat.training.InputDisparity"
@@ -133,6 +135,36 @@ def test_long_lrm_is_as_published(compose_train):
     first = compose_train(*options[:-1], "model=longlrm")
     assert first.model.prune.prune_ratio == 0
     assert first.data.window == [65, 129]  # 64 to 128 frames apart
+
+
+PUBLISHED = {"training.drop_above", "training.loss.opacity", "training.loss.perceptual"}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("scale", ["laptop", "paper"])
+@pytest.mark.parametrize("sweep", PAPER)
+def test_rows_are_trained_alike(compose_train, sweep, scale):
+    """They differ in the model; Long-LRM's of Tables 2 to 4 at the paper's scale as published."""
+    own = scale == "paper" and sweep in {"state_of_the_art", "replica", "inference_overhead"}
+    firsts: dict[str, tuple[dict, bool]] = {}
+    for row in load_paper()[sweep].rows:
+        if row.quoted:
+            continue
+        config = compose_train(f"sweeps={sweep}", f"scale={scale}", *row.run)
+        keys = [key for key in config if key != "hydra"]
+        options = flat_options(hashed_options(OmegaConf.masked_copy(config, keys), ()))
+        published = own and "model=longlrm" in row.run
+        first, of_first = firsts.setdefault(config.stage, (options, published))  # Table 1: three
+        differing = {key for key in first | options if first.get(key) != options.get(key)}
+        of_model = ("model.", "geometry_ratio", "parameter_budget")
+        differing = {key for key in differing if not key.startswith(of_model)}
+        assert differing == (PUBLISHED if published != of_first else set())
+
+
+def test_table_1_takes_steps_alone(compose_train):
+    trainer = compose_train("sweeps=training_overhead", "scale=paper").trainer
+    options = ("num_sanity_val_steps", "limit_val_batches", "limit_test_batches")
+    assert [trainer[option] for option in options] == [0, 0, 0]
 
 
 def test_table_5_takes_the_frames_of_an_index(compose_train):
