@@ -34,7 +34,13 @@ from asysplat.evaluation.post_optimization import (
 )
 from asysplat.evaluation.post_optimization import Predict as PredictScene
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
-from asysplat.evaluation.view_images import ViewImages, find_images, read_images
+from asysplat.evaluation.view_images import (
+    ViewImages,
+    find_images,
+    read_images,
+    view_names,
+    write_images,
+)
 from asysplat.export import write_safetensors
 from asysplat.export.gaussians import read_notes
 from asysplat.export.scene_folder import check_visible, find_files, world_origin
@@ -85,6 +91,9 @@ def evaluate(options: DictConfig) -> None:
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
+    if options.write_images is not None:  # raises where their names are not unique
+        for task in data.tests[data.name].tasks:
+            view_names(task)
     source = open_source(target.system, options, data, measure, net, fabric)
     measure = replace(measure, backgrounds=source.backgrounds)
     tests = {name: data.tests[name] for name in source.sets}
@@ -95,6 +104,9 @@ def evaluate(options: DictConfig) -> None:
     if options.write_gaussians is not None:
         folder = Path(options.write_gaussians)
         write_predictions(folder, tests[data.name], source.predict, fabric.device)
+    if options.write_images is not None:
+        folder = Path(options.write_images)
+        write_renderings(folder, tests[data.name], source.predict, measure, fabric.device)
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
@@ -278,6 +290,22 @@ def write_predictions(
         # In float64, which comes back from the world to the very same float32.
         write_safetensors(path, sample["frame"].to_world(gaussians), metadata, torch.float64)
     print(f"scenes: {folder}")
+
+
+def write_renderings(
+    folder: Path,
+    tests: FixedTasks,
+    predict: Predict,
+    measure: PostOptimization,
+    device: torch.device,
+) -> None:
+    """Write the renderings of every scene's test views, before any post-optimization."""
+    for index in track(range(len(tests)), "writing images"):
+        sample, names = tests[index], view_names(tests.tasks[index])
+        views = (sample[part].to(device) for part in ("inputs", "targets"))
+        inputs, targets, rendering = measure.draw(sample["scene"], predict(sample), *views)
+        write_images(folder / sample["scene"], names, rendering.image, inputs, targets)
+    print(f"images: {folder}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
@@ -37,14 +39,19 @@ def write_transforms(views: Views, folder: Path) -> None:
         (folder / "depth").mkdir(exist_ok=True)
         content["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
     for index, (name, frame) in enumerate(zip(names, content["frames"], strict=True)):
-        levels = (views.images[index].clamp(0, 1) * 255).round().to(torch.uint8)
-        Image.fromarray(levels.permute(1, 2, 0).numpy()).save(folder / "images" / name)
+        write_image(views.images[index], folder / "images" / name)
         if views.depths is not None:
             frame["depth_file_path"] = f"depth/{name}"
             steps = (views.depths[index].double() * STEPS_PER_UNIT).round().numpy()
             steps = np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)  # beyond it: unknown
             Image.fromarray(steps).save(folder / "depth" / name)
     target.write_text(json.dumps(content, indent=1))
+
+
+def write_image(image: Float[Tensor, "3 H W"], path: Path) -> None:
+    """Write RGB in [0, 1], clamped, with 8 bits a channel."""
+    levels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    Image.fromarray(levels.permute(1, 2, 0).numpy()).save(path)
 
 
 def describe_cameras(cameras: Cameras, files: Sequence[str]) -> dict[str, Any]:

@@ -86,10 +86,7 @@ class PostOptimization:
         `watch` is called after each step with the number of steps and, at the steps to measure, the
         rendering of the targets.
         """
-        behind = inputs.color_behind(inputs.mean_color())
-        known = self.backgrounds.get(scene, self.background)
-        background = behind if known is None else known
-        inputs, targets = (views.over(behind, background) for views in (inputs, targets))
+        inputs, targets, background = self._before_background(scene, inputs, targets)
         result = SceneResult(scene)
         for method, rows in self.protocol.measure_baselines(inputs, targets, self.lpips).items():
             result.add("targets", method, rows)
@@ -131,6 +128,22 @@ class PostOptimization:
                 )
             refine(predicted, inputs, PAPER, steps=steps, background=background, watch=after_step)
         return result
+
+    def draw(
+        self, scene: str, predict: Predict, inputs: Views, targets: Views
+    ) -> tuple[Views, Views, Rendering]:
+        """Return the views as they are measured, and the targets as rendered without any step."""
+        inputs, targets, background = self._before_background(scene, inputs, targets)
+        return inputs, targets, _render(predict(inputs), targets, background)
+
+    def _before_background(
+        self, scene: str, inputs: Views, targets: Views
+    ) -> tuple[Views, Views, Float[Tensor, "3"]]:
+        """Return the views before the background that the scene is measured on, and its color."""
+        behind = inputs.color_behind(inputs.mean_color())
+        known = self.backgrounds.get(scene, self.background)
+        background = behind if known is None else known
+        return inputs.over(behind, background), targets.over(behind, background), background
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Read the images that another system rendered of the test views, in place of a scene."""
+"""Read the images that a system rendered of the test views, in place of a scene; write ours."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,9 +13,15 @@ from asysplat.data.images import load_image
 from asysplat.data.readers.common import images_in
 from asysplat.data.sequence import FileSequence
 from asysplat.data.sources import Task
+from asysplat.data.write import write_image
 from asysplat.errors import InputError, list_names
+from asysplat.evaluation.metrics import nearest_view_images
+from asysplat.files import make_folder
 from asysplat.rendering import Rendering
-from asysplat.scene import Cameras
+from asysplat.scene import Cameras, Views
+
+# Folders of a scene's folder: what its renderings are compared with.
+TARGET, NEAREST_INPUT = "target", "nearest_input"
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,27 @@ def read_images(paths: Sequence[Path], height: int, width: int) -> ViewImages:
             )
         images.append(pixels.permute(2, 0, 1).float() / 255)
     return ViewImages(torch.stack(images))
+
+
+def write_images(
+    folder: Path, names: Sequence[str], rendered: Tensor, inputs: Views, targets: Views
+) -> None:
+    """Write a scene's renderings as `find_images` finds them, with targets and nearest inputs.
+
+    Args:
+        folder: of the scene.
+        names: of the test views, see `view_names`.
+        rendered: [V, 3, H, W].
+    """
+    written = {
+        folder: rendered,
+        folder / TARGET: targets.images,
+        folder / NEAREST_INPUT: nearest_view_images(inputs, targets),
+    }
+    for place, images in written.items():
+        make_folder(place, "write_images")
+        for name, image in zip(names, images.cpu(), strict=True):
+            write_image(image, place / f"{name}.png")
 
 
 def view_names(task: Task) -> list[str]:

@@ -23,7 +23,7 @@ SOURCES = ("run", "init_path", *SYSTEMS)
 # The others are train.py's.
 OWN_OPTIONS = (
     *("run", *SYSTEMS, "refinement_seconds", "refinement_steps"),
-    *("system", "post_optimization_steps", "write_gaussians"),
+    *("system", "post_optimization_steps", "write_gaussians", "write_images"),
 )
 # Their PLY files have positions divided by a quantile, and opacities that are no logits.
 UNREADABLE = ("pixelsplat", "mvsplat")
@@ -63,7 +63,10 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
             "refinement=...: give both, or neither."
         )
     if options.write_gaussians is not None:
-        _check_new(Path(options.write_gaussians), options)
+        _check_predicted(options)
+    for name in ("write_gaussians", "write_images"):
+        if options[name] is not None:
+            _check_new(Path(options[name]), name)
     names_data = any(override.startswith("data") for override in overrides)
     if system in ("gaussians", "images") and not names_data:
         raise InputError(
@@ -146,16 +149,20 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     return described
 
 
-def _check_new(folder: Path, options: DictConfig) -> None:
-    """Check that there is something to write to `folder`, and nothing there yet."""
+def _check_predicted(options: DictConfig) -> None:
+    """Check that there are predictions to write."""
     if options.run is None and options.init_path is None:
         raise InputError(
-            f"write_gaussians={folder} writes what a network predicts, of run=... or "
-            "init_path=...: give one of these, or leave it out."
+            f"write_gaussians={options.write_gaussians} writes what a network predicts, of run=... "
+            "or init_path=...: give one of these, or leave it out."
         )
+
+
+def _check_new(folder: Path, option: str) -> None:
+    """Check that a folder to write to holds nothing yet."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"write_gaussians={folder} exists and is not an empty folder: name a new one, "
+            f"{option}={folder} exists and is not an empty folder: name a new one, "
             "nothing is overwritten."
         )
 

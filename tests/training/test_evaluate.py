@@ -15,6 +15,7 @@ from tiny import STEPS as TRAINING
 from tiny_runs import COSTS, TINY_SCENES, finished
 
 from asysplat.data import SceneOptions, open_scene
+from asysplat.data.images import load_image
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation import scenes
@@ -255,6 +256,32 @@ def test_images_measure_as_the_gaussians_that_they_show(written, photographs, ev
     assert "test/files/post0/absrel" not in tested  # images have no depths
     assert tested == pytest.approx({key: expected[key] for key in tested}, abs=0.005)
     assert (folder / "figures" / "evaluation-post0.png").is_file()
+
+
+def test_written_images_measure_as_what_they_show(written, photographs, evaluate, tmp_path):
+    """As their PNGs exactly, and as the renderings but for their rounding to 8 bits."""
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "metrics=longlrm"]
+    data += ["post_optimization_steps=0"]
+    images = tmp_path / "images"
+    given = f"gaussians={written[0]}", f"write_images={images}"
+    _, rendered = read_evaluation(evaluate(*given, *data))
+    assert f"write_images={images} exists" in refusal(evaluate(*given, *data))
+    _, found = read_evaluation(evaluate(f"images={images}", *data))
+    key, room = "test/files/post0/psnr", images / photographs.name
+    assert found[key] == pytest.approx(rendered[key], abs=0.05)
+
+    names = sorted(path.name for path in room.glob("*.png"))
+    pixels = [
+        torch.stack([torch.tensor(load_image(place / name)) / 255 for name in names])
+        for place in (room, room / "target")
+    ]
+    assert len(names) == 2 and pixels[0].shape == (2, 32, 32, 3)
+    stored = [torch.tensor(load_image(photographs / "images" / name)) / 255 for name in names]
+    assert torch.equal(pixels[1], torch.stack(stored))
+    mse = (pixels[0] - pixels[1]).square().mean((1, 2, 3))
+    assert found[key] == pytest.approx(-10 * mse.log10().mean().item(), abs=1e-5)
+    nearest = {load_image(path).tobytes() for path in (room / "nearest_input").iterdir()}
+    assert nearest <= {load_image(path).tobytes() for path in (photographs / "images").iterdir()}
 
 
 REFINED = [*SIZE, *VIEWS, *TINY_SCENES, "metrics=longlrm"]
