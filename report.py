@@ -1,7 +1,8 @@
-"""Write finished sweeps beside the paper's tables, or finished reconstructions as one page.
+"""Write finished sweeps beside the paper's tables, reconstructions as a page, or a figure.
 
 python report.py table=layers costs=true
 python report.py runs=logs/reconstruct
+python report.py images=[ours,3dgs]
 """
 
 from collections.abc import Sequence
@@ -14,12 +15,13 @@ if __name__ == "__main__":
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 from rich.progress import track
 
 from asysplat.files import atomic_write, make_folder
 from asysplat.overrides import check_overrides
 from asysplat.terminal import make_console
+from paper.comparison import draw_views, read_views
 from paper.fill import fill_table, finished_runs, with_costs
 from paper.html import render_html
 from paper.markdown import render_markdown
@@ -29,16 +31,20 @@ from paper.tables import find_tables
 from paper.terminal import render_terminal
 
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "runs", "output")
+OWN_OPTIONS += ("images", "scenes", "views")  # of the figure
 
 
 @command("report")
 def report(options: DictConfig) -> None:
-    """Fill the tables, print them, write report.md and report.html; or the page of `runs`."""
+    """Fill the tables, print and write them; or the page of `runs`, the figure of `images`."""
     output = None if options.output is None else Path(str(options.output))
     if options.runs is not None:
         return report_reconstructions(Path(str(options.runs)), output)
-    tables, logs = find_tables(options.table), Path(options.logs)
+    logs = Path(options.logs)
     folder = output or logs / "report"
+    if options.images:
+        return report_images(options, folder)
+    tables = find_tables(options.table)
     make_folder(folder, "output")
     overrides = [*sweep_overrides(HydraConfig.get().overrides.task), *options.overrides]
     check_overrides(overrides)
@@ -53,6 +59,19 @@ def report(options: DictConfig) -> None:
     with atomic_write(folder / "report.html") as partial:
         partial.write_text(render_html(filled))
     console.print(f"page: {folder / 'report.html'}", soft_wrap=True)
+
+
+def report_images(options: DictConfig, folder: Path) -> None:
+    """Draw test views of several systems side by side, comparison.png."""
+    images, scenes, views = (
+        list(map(str, value if isinstance(value, ListConfig) else [value])) if value else []
+        for value in (options.images, options.scenes, options.views)
+    )
+    figure = draw_views(read_views(list(map(Path, images)), scenes, views))
+    make_folder(folder, "output")
+    with atomic_write(folder / "comparison.png") as partial:
+        figure.savefig(partial, dpi=200, bbox_inches="tight")
+    make_console().print(f"figure: {folder / 'comparison.png'}", soft_wrap=True)
 
 
 def sweep_overrides(overrides: Sequence[str]) -> list[str]:
