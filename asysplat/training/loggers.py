@@ -4,7 +4,7 @@ import logging
 import sys
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import timedelta
 from multiprocessing import current_process
 
@@ -41,19 +41,29 @@ def log_histogram(logger: Logger, name: str, values: Tensor, step: int) -> None:
         logger.experiment.add_histogram(name, values, step)
 
 
-def log_choices(logger: Logger, config: DictConfig) -> None:
-    """Log the options for the hparams tab, which needs the names of its metrics now."""
-    choices = {key: OmegaConf.select(config, key) for key in CHOICES}
+def log_charts(logger: Logger, metrics: Collection[str]) -> None:
+    """Log which curves share a chart of TensorBoard: PSNR of training and validation, above all."""
     if isinstance(logger, TensorBoardLogger):
-        logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in METRICS})
-    else:
-        logger.log_hyperparams(choices)
+        charts = {METRICS[name]: [f"val/{name}"] for name in METRICS if name in metrics}
+        charts[METRICS["psnr"]].append("train/psnr")
+        charts["loss"] = ["train/loss"]
+        charts = {title: ["Multiline", tags] for title, tags in charts.items()}
+        logger.experiment.add_custom_scalars({"training": charts})
+
+
+def log_choices(logger: Logger, config: DictConfig) -> None:
+    """Log the options that tell a run from others."""
+    logger.log_hyperparams({key: OmegaConf.select(config, key) for key in CHOICES})
 
 
 def log_results(logger: Logger, results: Mapping[str, str | int | float], data: str) -> None:
-    """Log the metrics of the test, for the hparams tab."""
-    values = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in METRICS}
-    logger.log_metrics({name: value for name, value in values.items() if value is not None})
+    """Log the metrics that the test measured, and no others, for the hparams tab."""
+    keys = {f"hp/{name}": f"test/{data}/{name}" for name in METRICS}
+    values = {name: results[key] for name, key in keys.items() if key in results}
+    if isinstance(logger, TensorBoardLogger):  # not earlier: the first list of metrics stays
+        logger.log_hyperparams(logger.hparams, values)
+    else:
+        logger.log_metrics(values)
     logger.save()
 
 

@@ -85,12 +85,11 @@ class TrainingStage:
         """Divide the batches between the processes, and write the first file: config.yaml."""
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
-        resumes = checkpoints.has_checkpoints(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if trainer.is_global_zero:
             print(split)
             OmegaConf.save(self.config, self.folder / "config.yaml", resolve=True)
-        if trainer.logger is not None and not resumes:
+        if trainer.logger is not None:
             log_choices(trainer.logger, self.config)
 
     @contextmanager

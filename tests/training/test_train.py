@@ -9,6 +9,8 @@ import pytest
 import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tiny_runs import COSTS, finished
 
 
@@ -64,9 +66,31 @@ def test_tensorboard_has_what_a_run_measures(whole):
     assert [event.step for event in counted] == [0, 2, 4, 6]
     assert counted[-1].histogram_value.num == metrics(whole)["cost/gaussians"]
     assert 0 < events.Scalars("gaussians/opacity_median")[-1].value < 1
-    last = events.Scalars("hp/psnr")[-1].value
-    assert abs(last - metrics(whole)["test/procedural/psnr"]) < 1e-3
     assert any(tag.startswith("val/") for tag in events.Tags()["images"])
+
+    layout = events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
+    (category,) = Layout.FromString(layout).category
+    charts = {chart.title: [*chart.multiline.tag] for chart in category.chart}
+    assert charts["PSNR (dB)"] == ["val/psnr", "train/psnr"] and charts["AbsRel"] == ["val/absrel"]
+    assert {tag for tags in charts.values() for tag in tags} <= set(events.Tags()["scalars"])
+
+
+def test_without_its_weights_lpips_is_in_no_hparams_tab(train, tmp_path, monkeypatch):
+    """Where 0, an initial value, would be the best possible."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = finished(train("steps=1", f"paths.weights={tmp_path}", "~callbacks.figures"))
+    numbers = metrics(folder)
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    experiment = events.PluginTagToContent("hparams")["_hparams_/experiment"]
+    listed = HParamsPluginData.FromString(experiment).experiment.metric_infos
+    names = {"psnr", "ssim", "absrel", "delta1"}
+    assert {info.name.tag for info in listed} == {f"hp/{name}" for name in names}
+    assert {tag for tag in events.Tags()["scalars"] if tag.startswith("hp/")} == {
+        f"hp/{name}" for name in names
+    }
+    for name in names:
+        (event,) = events.Scalars(f"hp/{name}")
+        assert abs(event.value - numbers[f"test/procedural/{name}"]) < 1e-3
 
 
 LEFT_OUT = [

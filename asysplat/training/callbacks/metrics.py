@@ -10,6 +10,7 @@ from lightning import Callback, Trainer
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import ImageRow, average, write_csv
 from asysplat.evaluation.protocol import Protocol
+from asysplat.training.loggers import log_charts
 from asysplat.training.module import SplattingModule
 from asysplat.training.parallel import Batch, Prediction
 
@@ -26,7 +27,7 @@ class Metrics(Callback):
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
         self.protocol, self.folder = protocol, Path(folder)
         self.backbone_dir, self.download = Path(backbone_dir), download
-        self.rows: list[ImageRow] = []
+        self.charted, self.rows = False, list[ImageRow]()
         self.early_exit_rows: list[ImageRow] = []
         described = protocol.describe().items()
         self.results: dict[str, float | str] = {f"protocol/{k}": text for k, text in described}
@@ -80,6 +81,9 @@ class Metrics(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
+        for logger in () if self.charted else trainer.loggers:
+            log_charts(logger, means)
+        self.charted = True
 
     def on_test_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         rows, early_exit_rows = gather(trainer, self.rows), gather(trainer, self.early_exit_rows)
