@@ -112,7 +112,7 @@ def evaluate(options: DictConfig) -> None:
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
     results = {**target.fingerprint, **source.facts}
     results["evaluation/post_optimization"] = POST_OPTIMIZATION_METHOD
-    results |= {f"protocol/{k}": v for k, v in measure.protocol.describe().items()}
+    results |= measure.protocol.notes(measure.lpips)
     results |= set_results(scenes, measure.protocol.mean_over)
     if target.system in ("gaussians", "images"):  # reading a file is no prediction
         left_out = "cost/" if target.system == "images" else "cost/post0/"
@@ -162,7 +162,7 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     protocol = instantiate(config.metrics)
     lpips = load_lpips(protocol.lpips_net, Path(options.paths.weights), options.paths.download)
     if lpips is None:
-        warnings.warn(protocol.without_lpips(), stacklevel=1)
+        warnings.warn(f"LPIPS is {protocol.without_lpips()}.", stacklevel=1)
     else:
         lpips.to(device)
     steps = options.post_optimization_steps

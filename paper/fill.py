@@ -253,13 +253,14 @@ def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
 
 
 def _metrics(table: PaperTable, config: DictConfig, runs: Sequence[Run]) -> tuple[str, ...]:
-    """Describe the metrics of the table in each run's protocol; without a run, name it."""
+    """Describe the metrics of the table in each run's protocol, or why it has none; name it."""
     kinds = {column.key.rpartition("/")[-1]: column.kind for column in table.columns}
     texts = []
     for results in [run.results for run in runs] or [{}]:
-        protocol = {k.partition("/")[2]: v for k, v in results.items() if k.startswith("protocol/")}
-        sentences = [f"{kinds[kind]}: {text}" for kind, text in protocol.items() if kind in kinds]
-        name = protocol.get("name", config.metrics.name)
+        keys = [key.split("/") for key in results]
+        said = {key[1]: results["/".join(key)] for key in keys if key[0] in ("protocol", "missing")}
+        sentences = [f"{kinds[kind]}: {text}" for kind, text in said.items() if kind in kinds]
+        name = said.get("name", config.metrics.name)
         texts.append(". ".join([f"protocol {name}", *sentences]))
     return tuple(dict.fromkeys(texts))
 

@@ -17,7 +17,7 @@ from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.root import typed
 from asysplat.runs.run_config import flat_options
 from asysplat.runs.runs import PICTURE, RECONSTRUCTION, RESULTS, files_below
-from asysplat.runs.summary import metric_cells
+from asysplat.runs.summary import metric_cells, missing_metrics
 from asysplat.terminal import make_console
 from paper.grid import Cell, Grid, Heading
 from paper.html import TEMPLATES
@@ -104,7 +104,8 @@ def make_overview(folder: Path, runs: Sequence[Reconstruction]) -> Grid:
         cells += [", ".join(f"{key}={run.options[key]}" for key in differing if key in run.options)]
         name = run.folder.relative_to(folder).as_posix()
         lines.append([Cell(name, link=f"run-{number}"), *map(Cell, cells)])
-    return Grid(CAPTION, headings, lines)
+    missing = dict.fromkeys(text for run in runs for text in missing_metrics(run.results))
+    return Grid(" ".join([CAPTION, *missing]), headings, lines)
 
 
 def link_files(run: Reconstruction, page: Path) -> dict[str, str]:

@@ -68,10 +68,10 @@ class Protocol:
         return values
 
     def without_lpips(self) -> str:
-        """Return a warning that LPIPS is not computed, and how to get its backbone."""
+        """Return why LPIPS is not measured without a backbone, and what brings it."""
         return (
-            f"{BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in paths.weights: "
-            "the run continues without LPIPS; paths.download=true fetches it."
+            f"not measured, as {BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in "
+            "paths.weights; paths.download=true fetches it"
         )
 
     def _prepare(self, rendered: Images, targets: Views) -> Images:
@@ -120,6 +120,14 @@ class Protocol:
             name: self.measure_views(draw(inputs, targets), None, targets, lpips, psnr_only)
             for name, (_, draw) in BASELINES.items()
         }
+
+    def notes(self, lpips: nn.Module | None) -> dict[str, str]:
+        """Return what results say of their metrics: protocol/<metric>, or missing/lpips: why."""
+        notes = {f"protocol/{name}": text for name, text in self.describe().items()}
+        if lpips is None:
+            del notes["protocol/lpips"]
+            notes["missing/lpips"] = self.without_lpips()
+        return notes
 
     def describe(self) -> dict[str, str]:
         """Describe each metric, after the protocol's name."""

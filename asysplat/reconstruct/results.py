@@ -28,7 +28,12 @@ from asysplat.reconstruct.video import check_video, object_center, video_cameras
 from asysplat.refinement import AnchorScene, RefinementProgress
 from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import PICTURE, SCENE
-from asysplat.runs.summary import RECONSTRUCTION_ROWS, metric_cells, write_json
+from asysplat.runs.summary import (
+    RECONSTRUCTION_ROWS,
+    metric_cells,
+    print_missing,
+    write_json,
+)
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.terminal import make_console, print_table
 
@@ -60,7 +65,7 @@ class Results:
         if has_path and not self._has_video:
             print("no video: it needs PyAV, pip install 'asysplat[video]'.")
         if self._lpips is None:
-            print("no LPIPS: its weights are missing; paths.download=true downloads them.")
+            print(f"LPIPS is {self._protocol.without_lpips()}.")
 
     def save_start(
         self, gaussians: Gaussians, photographs: Photographs, background: Float[Tensor, "3"]
@@ -152,8 +157,7 @@ class Results:
         """Write metrics.json and metrics.csv, and print the table."""
         results: dict[str, float | int | str] = {"gaussians": scene.num_gaussians}
         results |= {"steps": progress.step, "seconds": progress.seconds}
-        descriptions = self._protocol.describe()
-        results |= {f"protocol/{name}": description for name, description in descriptions.items()}
+        results |= self._protocol.notes(self._lpips)
         photographs, rows = self._photographs, []
         inputs, held_out = photographs.inputs, photographs.held_out
         sets = {"inputs": (inputs, photographs.input_files)}
@@ -226,10 +230,12 @@ def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
 
 def _print_table(results: dict[str, float | int | str]) -> None:
     rows = RECONSTRUCTION_ROWS
-    metrics = [m for m in METRICS if any(f"{row}/{m}" in results for row in rows.values())]
+    shown = [*rows.values(), "missing"]
+    metrics = [m for m in METRICS if any(f"{prefix}/{m}" in results for prefix in shown)]
     cells = [
         [title, *metric_cells(results, row, metrics)]
         for title, row in rows.items()
         if f"{row}/psnr" in results
     ]
     print_table(make_console(), ["", *(METRICS[metric] for metric in metrics)], cells)
+    print_missing(results)

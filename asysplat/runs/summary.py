@@ -42,6 +42,18 @@ def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
     return ["" if value is None else f"{value:.{digits}f}" for value in values]
 
 
+def missing_metrics(results: Results) -> list[str]:
+    """Return a sentence for each metric that could not be measured, whose column is empty."""
+    names = [name for name in METRICS if f"missing/{name}" in results]
+    return [f"{METRICS[name]}: {results[f'missing/{name}']}." for name in names]
+
+
+def print_missing(results: Results) -> None:
+    """Print the sentences of `missing_metrics`, each in a line."""
+    for sentence in missing_metrics(results):
+        print(sentence)
+
+
 def describe_costs(results: Results) -> str:
     """Describe the measured costs in a line; empty if none were measured."""
     costs = []
@@ -64,7 +76,8 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
     console = make_console()
     if data in test_sets:
-        metrics = [name for name in METRICS if f"test/{data}/{name}" in results]
+        shown = (f"test/{data}", "missing")
+        metrics = [name for name in METRICS if any(f"{key}/{name}" in results for key in shown)]
         ending = f"/test/{data}/psnr"
         stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
         methods = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
@@ -80,6 +93,7 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
             for name in other_sets
         ]
         print_table(console, ["", *ROWS], rows, "other test sets, PSNR (dB)")
+    print_missing(results)
     if costs := describe_costs(results):
         print(costs)
     _print_figures(folder, "test")
@@ -92,7 +106,8 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
         costs = "cost" if name == sets[0] else f"cost/{name}"
         keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
         steps = sorted({int(key[2].removeprefix("post")) for key in keys})
-        metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
+        shown = {key[-1] for key in keys} | {m for m in METRICS if f"missing/{m}" in results}
+        metrics = [metric for metric in METRICS if metric in shown]
         title = f"test scenes: {name}, metrics: {results['protocol/name']}"
         if f"{costs}/gaussians" in results:  # none of images
             title += f", {results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
@@ -106,6 +121,7 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
             cells = metric_cells(results, prefix, metrics)
             rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
         print_table(make_console(), titles, rows, title)
+    print_missing(results)
     _print_figures(folder, "evaluation")
     print(f"evaluation: {folder}")
 

@@ -10,7 +10,7 @@ from rich.table import Column, Table
 
 from asysplat.evaluation.metrics import METRICS
 from asysplat.runs.runs import Run, find_run
-from asysplat.runs.summary import BASELINE_ROWS, metric_cells
+from asysplat.runs.summary import BASELINE_ROWS, metric_cells, missing_metrics
 from asysplat.terminal import make_console
 
 Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration, its finished run
@@ -77,4 +77,6 @@ def sweep_table(jobs: Sequence[Job]) -> Table:
         space = [""] * (len(varied) + 1)
         cells = metric_cells(results_of_runs[-1], prefix.format(names[0]))
         table.add_row(label, *space, *cells)
+    sentences = [text for results in results_of_runs for text in missing_metrics(results)]
+    table.caption = "\n".join(dict.fromkeys(sentences))
     return table

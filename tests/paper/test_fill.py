@@ -133,12 +133,13 @@ def test_runs_on_the_papers_data(compose, tmp_path):
     )
     numbers = {"test/dl3dv/psnr": 19.0, "test/mipnerf360/psnr": 17.0, "protocol/name": "longlrm"}
     numbers |= {"protocol/psnr": "of each image", "protocol/absrel": "of depths"}  # not printed
+    numbers |= {"missing/ssim": "not measured, as"}
     write_run(tmp_path / "run", config, numbers, 0)
     runs = finished_runs(tmp_path)
     filled = fill_table(load_paper()["geometry_ratio"], ["data=dl3dv"], compose, runs)
     assert filled.rows[0].values == {"dl3dv/psnr": [19.0], "mipnerf360/psnr": [17.0]}
     assert filled.sets == {"dl3dv": "dl3dv", "mipnerf360": "mipnerf360"}
-    assert filled.metrics == ("protocol longlrm. PSNR: of each image",)
+    assert filled.metrics == ("protocol longlrm. PSNR: of each image. SSIM: not measured, as",)
     assert filled.notes["Data"] == "DL3DV and Benchmark"
     assert filled.rows[0].revisions == (revision(),)
     assert filled.notes["Not tested"] == ""

@@ -73,12 +73,13 @@ def lines(folder: Path) -> list[list[str]]:
 
 
 def test_the_page_has_numbers_options_and_files(tmp_path, capsys):
-    write_run(tmp_path / "old", {"held_out/psnr": 24.0}, {"steps": 30}, age=9)
+    missing = {"missing/lpips": "not measured, as"}
+    write_run(tmp_path / "old", {"held_out/psnr": 24.0} | missing, {"steps": 30}, age=9)
     write_run(tmp_path / "deep" / "new")
     report_reconstructions(tmp_path)
     said = capsys.readouterr().out
     assert said.splitlines()[-1] == f"page: {tmp_path / 'reconstructions.html'}"
-    assert "25.000" in said and "desk" in said
+    assert "25.000" in said and "desk" in said and "LPIPS: not measured, as." in said
     page = Page(tmp_path / "reconstructions.html")
     for text in ("deep/new", "desk", "25.000", "12.000", "19.000", "1,500", "steps=30"):
         assert text in page.texts

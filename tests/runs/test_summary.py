@@ -21,7 +21,8 @@ STEP = {"cost/seconds_per_step": 2.0}
 @pytest.mark.parametrize(
     "results, shown, hidden",
     [
-        (METRICS | STATIC | STEP, ["longlrm", "21.500", "2.00M", "2.00 s a step"], []),
+        (METRICS | {"missing/lpips": "x=y"}, ["LPIPS", "\nLPIPS: x=y.\n"], ["SSIM"]),
+        (METRICS | STATIC | STEP, ["longlrm", "21.500", "2.00M", "2.00 s a step"], ["LPIPS"]),
         (STATIC | STEP, ["2.00M", "2.00 s a step"], ["test scenes", "PSNR"]),
         ({}, [], ["parameters", "PSNR"]),
     ],

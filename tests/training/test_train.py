@@ -75,10 +75,13 @@ def test_tensorboard_has_what_a_run_measures(whole):
     assert {tag for tags in charts.values() for tag in tags} <= set(events.Tags()["scalars"])
 
 
-def test_without_its_weights_lpips_is_in_no_hparams_tab(train, tmp_path, monkeypatch):
-    """Where 0, an initial value, would be the best possible."""
+def test_without_its_weights_lpips_is_missing_and_not_zero(train, tmp_path, monkeypatch):
+    """The table says why, and the hparams tab has no initial value, as 0 is the best possible."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    folder = finished(train("steps=1", f"paths.weights={tmp_path}", "~callbacks.figures"))
+    result = train("steps=1", f"paths.weights={tmp_path}", "~callbacks.figures")
+    folder = finished(result)
+    table, _, rest = result.stdout.rpartition("LPIPS: not measured, as AlexNet is neither in ")
+    assert "LPIPS" in table.rpartition("test scenes")[2] and "paths.download=true" in rest
     numbers = metrics(folder)
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
     experiment = events.PluginTagToContent("hparams")["_hparams_/experiment"]
@@ -132,8 +135,8 @@ def test_without_some_callbacks_the_rest_is_there(train, names, tmp_path, monkey
     }
     for name, there in left.items():
         assert set(there) == {name not in names}, name
-    warning = "warning: AlexNet is neither in torch's hub cache nor in paths.weights: the run"
-    assert (f"{warning} continues without LPIPS" in result.stderr) == ("metrics" not in names)
+    warning = "warning: LPIPS is not measured, as AlexNet is neither in torch's hub cache nor in"
+    assert (warning in result.stderr) == ("metrics" not in names)
     assert not list(folder.glob("tensorboard/**/*.ckpt"))
     assert "Epoch" not in result.stdout + result.stderr
 

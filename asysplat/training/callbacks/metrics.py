@@ -29,15 +29,15 @@ class Metrics(Callback):
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.charted, self.rows = False, list[ImageRow]()
         self.early_exit_rows: list[ImageRow] = []
-        described = protocol.describe().items()
-        self.results: dict[str, float | str] = {f"protocol/{k}": text for k, text in described}
+        self.results: dict[str, float | str] = {}
 
     def setup(self, trainer: Trainer, module: SplattingModule, stage: str) -> None:
         if hasattr(self, "lpips"):
             return
         self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
-            warnings.warn(self.protocol.without_lpips(), stacklevel=1)
+            warnings.warn(f"LPIPS is {self.protocol.without_lpips()}.", stacklevel=1)
+        self.results |= self.protocol.notes(self.lpips)
 
     def _add(self, test_set: str, batch: Batch, prediction: Prediction, validation: bool) -> None:
         lpips = None if self.lpips is None else self.lpips.to(prediction.rendering.image.device)
