@@ -97,7 +97,9 @@ def evaluate(options: DictConfig) -> None:
     source = open_source(target.system, options, data, measure, net, fabric)
     measure = replace(measure, backgrounds=source.backgrounds)
     tests = {name: data.tests[name] for name in source.sets}
-    folders = target.folder, target.scene_folder
+    # Apart, so that they are measured again once its weights are there
+    subfolder = "without_lpips" if measure.lpips is None else ""
+    folders = target.folder, target.scene_folder / subfolder
     scenes = measure_scenes(
         tests, source.predict, measure, fabric.device, *folders, source.early_exit
     )

@@ -53,6 +53,21 @@ def read_evaluation(result) -> tuple[Path, dict]:
     return Path(folder), json.loads((Path(folder) / "evaluation.json").read_text())
 
 
+@pytest.mark.medium
+def test_lpips_is_measured_once_its_weights_are_there(
+    whole, evaluate, shared, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    options = [f"init_path={whole}/checkpoints/last.ckpt", *MODEL, *VIEWS, *TINY_SCENES]
+    options += ["post_optimization_steps=0", "data.test_sets={}"]
+    without = evaluate(*options, f"paths.weights={tmp_path}")
+    _, results = read_evaluation(without)
+    assert "test/procedural/post0/lpips" not in results and "paths.download" in without.stdout
+    assert results["missing/lpips"].startswith("not measured, as VGG16 is neither in")
+    _, results = read_evaluation(evaluate(*options, f"paths.weights={shared}/weights"))
+    assert results["test/procedural/post0/lpips"] > 0 and "missing/lpips" not in results
+
+
 def qualities(results: dict) -> dict:
     return {k: v for k, v in results.items() if k.split("/")[0] in ("test", "inputs", "baseline")}
 
