@@ -41,7 +41,12 @@ COST_CAPTION = (
     "paper counts them; true ones have attention products, scans and depthwise convolutions too. "
     "Geometry is the share of the parameters in that branch."
 )
-CLAIM_FORMS = {"reduction": "{:.1%}", "speedup": "{:,.0f}x", "total": "{:.3g} h"}
+CLAIM_FORMS = {
+    "reduction": "{:.1%}",
+    "speedup": "{:,.0f}x",
+    "gain": "{:+.2f}",
+    "total": "{:.3g} h",
+}
 CLAIM_CAPTION = (
     "Paper: computed from the numbers that its tables print. Ours: from those of AsySplat and of "
     "what it is compared with; hours are summed over the stages."

@@ -97,15 +97,18 @@ def pooled_std(groups: Sequence[Sequence[Number]]) -> float | None:
 def claim_value(claim: Claim, number: Callable[[PaperRow], Number | None]) -> float | None:
     """Compute a claim from numbers of its rows, summed on each side; None where one is missing.
 
-    "reduction" is 1 - first side / second side, "speedup" second / first, "total" the first.
+    "reduction" is 1 - first side / second side, "speedup" second / first, "gain" first - second,
+    "total" the first.
     """
     numbers = [[number(row) for row in side] for side in claim.rows]
     if any(None in side for side in numbers):
         return None
-    first, *second = map(sum, numbers)
+    first, *others = map(sum, numbers)
     if claim.form == "total":
         return float(first)
-    return 1 - first / second[0] if claim.form == "reduction" else second[0] / first
+    (second,) = others
+    values = {"reduction": 1 - first / second, "speedup": second / first, "gain": first - second}
+    return values[claim.form]
 
 
 def cost_errors(row: PaperRow, costs: Costs) -> dict[str, float]:

@@ -8,9 +8,11 @@ from functools import partial
 from typing import Any
 
 from asysplat.data.datamodule import SceneDataModule
+from asysplat.data.images import Resampling
 from asysplat.data.sequence import SceneOptions
 from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task, has_root, tested_sets
 from asysplat.errors import InputError
+from asysplat.ranges import check_options
 
 SIZE = ("height", "width")
 MODULE_OPTIONS = set(inspect.signature(SceneDataModule).parameters) - {*SIZE, "source", "on_error"}
@@ -56,6 +58,7 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
 def _files_source(**options: Any) -> FilesSource:
     names = {field.name for field in fields(SceneOptions)} & options.keys()
     scene = SceneOptions(**{name: options.pop(name) for name in names})
+    check_options({"data.resampling": scene.resampling}, {"data.resampling": Resampling})
     return FilesSource(options=scene, **options)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -56,6 +56,8 @@ class EncodedImage:
 
 ImageFile = Path | EncodedImage
 Content = TypeVar("Content")
+# The first two are antialiased; bilinear is between the four nearest pixels alone, as Long-LRM's.
+Resampling = Literal["lanczos", "bicubic", "bilinear"]
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     return _read(path, _to_rgb)
 
 
-def load_reduced(path: ImageFile, least: int) -> UInt8[ndarray, "h w 3"]:
+def load_reduced(path: ImageFile, least: float) -> UInt8[ndarray, "h w 3"]:
     """Read an image as `load_image`, but a JPEG at 1/8, 1/4 or 1/2 of its size, if that is enough.
 
     Decoding takes less time then. The first fraction is taken that leaves both sides a whole number
@@ -211,20 +213,28 @@ def undistort(
 
 
 def resize_and_crop(
-    pixels: Shaped[ndarray, "h w *channels"], height: int, width: int, nearest: bool = False
+    pixels: Shaped[ndarray, "h w *channels"],
+    height: int,
+    width: int,
+    nearest: bool = False,
+    resampling: Resampling = "lanczos",
 ) -> Shaped[ndarray, "height width *channels"]:
     """Crop to the largest centered part with the given proportions; resize to `height` x `width`.
 
-    Antialiased (Lanczos), or the pixel under each new center with `nearest`; of booleans, True
-    where all pixels are that the new one covers.
+    By `resampling`, or the pixel under each new center with `nearest`; of booleans, True where all
+    pixels are that the new one covers.
     """
     box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)[1:]
     if pixels.dtype == bool:
         coverage = Image.fromarray(pixels.astype(np.float32))
         coverage = coverage.resize((width, height), Image.Resampling.BOX, box)
         return np.asarray(coverage) > WHOLE
-    method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
-    return np.asarray(Image.fromarray(pixels).resize((width, height), method, box))
+    image, size = Image.fromarray(pixels), (width, height)
+    if resampling == "bilinear" and not nearest:
+        part = Image.Transform.EXTENT
+        return np.asarray(image.transform(size, part, box, Image.Resampling.BILINEAR))
+    method = Image.Resampling["NEAREST" if nearest else resampling.upper()]
+    return np.asarray(image.resize(size, method, box))
 
 
 def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:

@@ -1,6 +1,7 @@
 """Posed images of one place: the interface that all of them follow, and the images on disk."""
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,6 +19,7 @@ from asysplat.data.cache import ImageCache
 from asysplat.data.images import (
     ImageFile,
     Lens,
+    Resampling,
     content_hash,
     load_alpha,
     load_depth,
@@ -72,6 +74,7 @@ class SceneOptions:
         on_error: "fail" raises one error that names every image that cannot be used; "skip"
             leaves those images out with a warning, and decodes each image once to find them.
         masks: whether masks are of an object or of what to ignore; see `with_masks`.
+        resampling: how photographs and alphas are resized, see `Resampling`.
         cache: keeps decoded pixels; None keeps none.
         disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
     """
@@ -81,6 +84,7 @@ class SceneOptions:
     layout: str = "auto"
     on_error: Policy = "fail"
     masks: MasksOf = "auto"
+    resampling: Resampling = "lanczos"
     cache: ImageCache | None = None
     disparities: Path | str | None = None
 
@@ -219,7 +223,9 @@ class FileSequence:
         return self.with_images(intact)
 
     def _image(self, image: PosedImage) -> Float[Tensor, "3 H W"]:
-        least = OVERSAMPLING * max(self.options.height, self.options.width)
+        # A reduced image is antialiased.
+        factor = math.inf if self.options.resampling == "bilinear" else OVERSAMPLING
+        least = factor * max(self.options.height, self.options.width)
 
         def load_photograph(file: ImageFile) -> ndarray:
             return load_reduced(file, least)
@@ -274,7 +280,7 @@ class FileSequence:
         # Arrays are copied, since those from the cache and from Pillow are read-only.
         if cache is None:
             return torch.tensor(self._fit(load(file), lens, nearest))
-        made_from = repr((lens, *size, load.__name__)).encode()
+        made_from = repr((lens, *size, load.__name__, self.options.resampling)).encode()
         key = f"{content_hash(file)}-{hashlib.blake2b(made_from, digest_size=8).hexdigest()}"
         # Pixels that are neither undistorted nor resized are as quickly decoded again.
         changed = lens.is_distorted or (lens.height, lens.width) != size
@@ -282,4 +288,6 @@ class FileSequence:
 
     def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> ndarray:
         pixels = undistort(pixels, lens, nearest)
-        return resize_and_crop(pixels, self.options.height, self.options.width, nearest)
+        options = self.options
+        size = options.height, options.width
+        return resize_and_crop(pixels, *size, nearest, options.resampling)

@@ -1,6 +1,8 @@
 import cv2
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 from PIL import Image
 
 from asysplat.data.images import (
@@ -123,6 +125,17 @@ def test_shrinking_averages_and_the_same_size_changes_nothing():
     # Nearest takes the pixel under each new center.
     depth = np.arange(36, dtype=np.float32).reshape(6, 6)
     assert np.array_equal(resize_and_crop(depth, 2, 2, nearest=True), depth[[1, 4]][:, [1, 4]])
+
+
+def test_bilinear_is_between_the_nearest_pixels():
+    """As Long-LRM's, torch's without antialiasing."""
+    pixels = np.random.default_rng(0).random((48, 96)).astype(np.float32)
+    for size in ((16, 32), (11, 22), (60, 120)):
+        found = resize_and_crop(pixels, *size, resampling="bilinear")
+        expected = F.interpolate(torch.from_numpy(pixels)[None, None], size, mode="bilinear")
+        assert np.allclose(found, expected[0, 0].numpy(), atol=1e-5)
+    smooth = resize_and_crop(pixels, 12, 24, resampling="bicubic")
+    assert smooth.std() < 0.5 * resize_and_crop(pixels, 12, 24, resampling="bilinear").std()
 
 
 def test_a_mask_keeps_pixels_that_are_kept_wholly():

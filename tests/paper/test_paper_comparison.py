@@ -98,6 +98,7 @@ def test_a_claim_compares_the_sums_of_its_sides():
 
     assert claim_value(claim("reduction", [1.0, 2.0], [4.0, 2.0]), number) == 0.5
     assert claim_value(claim("speedup", [2.0], [6.0]), number) == 3
+    assert claim_value(claim("gain", [2.5], [2.0]), number) == 0.5
     assert claim_value(claim("total", [2.0, 3.0], []), number) == 5
     assert claim_value(claim("speedup", [2.0], [6.0]), lambda row: None) is None
 
