@@ -117,7 +117,8 @@ def fill_table(
         row = replace(row, values=values, note=note, options=options)
         if values:
             revisions = tuple(sorted({run.revision for run in row_runs.values()}))
-            row = replace(row, seeds=tuple(sorted(row_runs)), revisions=revisions)
+            folders = tuple(str(row_runs[seed].folder) for seed in sorted(row_runs))
+            row = replace(row, seeds=tuple(sorted(row_runs)), folders=folders, revisions=revisions)
         rows.append(row)
     data = config.data
     height, width = data.test_size or (data.height, data.width)

@@ -1,6 +1,8 @@
 """Plot filled tables: ours on the left, the paper's on the right."""
 
+import csv
 import re
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -27,8 +29,9 @@ MIN_RANGE = 1.1
 def make_plots(filled: PaperTable) -> list[tuple[str, Figure]]:
     """Plot what the table does not show; return caption and figure of each plot.
 
-    Lines for a table of one ratio; for others a dot for each seed, and quality against cost if the
-    rows' costs differ. There is no plot below two rows that ran.
+    Lines for a table of one ratio; for others a dot for each seed, quality against cost if the
+    rows' costs differ, and a dot for each image if depths are measured. There is no plot below two
+    rows that ran.
     """
     column = filled.ranked_column
     if column is None or sum(column.key in row.values for row in filled.rows) < 2:
@@ -36,7 +39,8 @@ def make_plots(filled: PaperTable) -> list[tuple[str, Figure]]:
     with matplotlib.rc_context(STYLE):
         if filled.key in RATIOS:
             return [_ratio_plot(filled)]
-        return [_seed_plot(filled, column), *_pareto_plot(filled, column)]
+        plots = [_seed_plot(filled, column), *_pareto_plot(filled, column)]
+        return plots + _image_plot(filled)
 
 
 def _seed_plot(filled: PaperTable, column: Column) -> tuple[str, Figure]:
@@ -129,3 +133,38 @@ def _pareto_plot(filled: PaperTable, quality: Column) -> list[tuple[str, Figure]
         axes.locator_params(nbins=5)
     caption = f"{quality.kind} against {cost.title()}: no row beats those on the line in both."
     return [(caption, figure)]
+
+
+def _image_plot(filled: PaperTable) -> list[tuple[str, Figure]]:
+    """Plot the PSNR of each test image over its AbsRel, as the paper's Figure 1."""
+    column = next((c for c in filled.columns if c.key.endswith("/absrel")), None)
+    if column is None:
+        return []
+    test_set = filled.sets.get(column.test_set, column.test_set)
+    points = {
+        row.label: [point for folder in row.folders for point in _image_points(folder, test_set)]
+        for row in filled.rows
+    }
+    points = {label: np.array(of_row) for label, of_row in points.items() if of_row}
+    if not points:
+        return []
+    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for label, of_row in points.items():
+        (dots,) = axes.plot(*of_row.T, "o", ms=4, alpha=0.35, mew=0, rasterized=True)
+        mean = of_row.mean(0)
+        axes.plot(*mean, "o", ms=11, color=dots.get_color(), mec="white", label=label)
+    axes.set(xscale="log", xlabel=f"{filled.our_title(column)} ↓", ylabel="PSNR (dB) ↑")
+    axes.legend(frameon=False)
+    caption = f"PSNR of each image of {test_set} over its AbsRel; large: the means of the rows."
+    return [(caption, figure)]
+
+
+def _image_points(folder: str, test_set: str) -> list[tuple[float, float]]:
+    """Read AbsRel and PSNR of each image of a test set from a run's metrics.csv."""
+    path = Path(folder) / "metrics.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["set"] == test_set and row.get("absrel")]
+    return [(float(row["absrel"]), float(row["psnr"])) for row in rows]

@@ -64,6 +64,7 @@ class PaperRow:
     # Column key -> measured numbers, one for each seed; a column without any is left out
     values: dict[str, list[Number]] = field(default_factory=dict)
     seeds: tuple[int, ...] = ()  # seeds of the runs
+    folders: tuple[str, ...] = ()  # folders of the runs
     revisions: tuple[str, ...] = ()  # revisions of their code, see `asysplat.runs.machine`
     note: str = ""  # a remark on this row, such as "seeds still to run: 2"
     options: tuple[str, ...] = ()  # options that end the note, the most important first

@@ -3,14 +3,16 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from io import StringIO
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from asysplat.evaluation.metrics import write_csv
 from paper.fill import COMPUTED
 from paper.html import render_html
 from paper.markdown import escape, render_markdown
 from paper.plots import make_plots
-from paper.tables import Column, PaperRow, PaperTable
+from paper.tables import Column, PaperRow, PaperTable, load_paper
 from paper.terminal import render_terminal
 
 COLUMNS = (
@@ -250,3 +252,22 @@ def test_plots_show_every_seed_and_the_paper(table, ratios):
         line for line in ours.lines if len(line.get_xdata()) == 3 and line.get_marker() == "o"
     ]
     assert list(mean.get_ydata()) == [21.5, 20.5, 19.5]
+
+
+def test_images_are_plotted_where_depths_are_measured(tmp_path):
+    """As the paper's Figure 1: a dot for each image of our set, a color for each row."""
+    rows = ({"set": s, "absrel": a, "psnr": 20 + a} for s in ("rooms", "other") for a in (0.2, 0.4))
+    write_csv(tmp_path / "metrics.csv", list(rows))
+    table = load_paper()["asymmetry"]
+    first, second, last = table.rows
+    run = {"values": {"dl3dv/psnr": [20.0]}, "seeds": (0,), "folders": (str(tmp_path),)}
+    rows = (replace(first, **run), replace(second, **run), last)
+    table = replace(table, rows=rows, sets={"dl3dv": "procedural", "scannetpp": "rooms"})
+    *_, (caption, figure) = make_plots(table)
+    (axes,) = figure.axes
+    assert "rooms" in caption and axes.get_xlabel() == "rooms AbsRel ↓"
+    dots, mean, *others = axes.lines
+    assert dots.get_xdata().tolist() == [0.2, 0.4] and dots.get_ydata().tolist() == [20.2, 20.4]
+    assert np.allclose([*mean.get_xdata(), *mean.get_ydata()], [0.3, 20.3])
+    assert mean.get_color() == dots.get_color() != others[0].get_color()
+    assert [text.get_text() for text in axes.get_legend().texts] == [first.label, second.label]
