@@ -46,7 +46,13 @@ from asysplat.export.gaussians import read_notes
 from asysplat.export.scene_folder import check_visible, find_files, world_origin
 from asysplat.files import check_writable, make_folder
 from asysplat.models.network import Network
-from asysplat.refinement import AnchorScene, ScaffoldSettings, refine, refine_scaffold
+from asysplat.refinement import (
+    AnchorScene,
+    RefinementProgress,
+    ScaffoldSettings,
+    refine,
+    refine_scaffold,
+)
 from asysplat.refinement.init import initial_gaussians
 from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.evaluation_target import find_target
@@ -69,6 +75,7 @@ class PredictionSource:
         facts: what its results depend on, in addition to the target's fingerprint.
         backgrounds: RGB [3] behind its scenes, by scene; the measure's own for the others.
         early_exit: fractions that the last prediction has skipped, changed by each.
+        costs: of the last prediction besides seconds and memory, changed by each.
     """
 
     predict: Predict
@@ -76,6 +83,7 @@ class PredictionSource:
     facts: Mapping[str, float] = field(default_factory=dict)
     backgrounds: Mapping[str, Tensor] = field(default_factory=dict)
     early_exit: Mapping[str, float] = field(default_factory=dict)
+    costs: Mapping[str, float] = field(default_factory=dict)
 
 
 @command("evaluate", "stopped; the same command resumes with the scenes that are missing.")
@@ -100,9 +108,8 @@ def evaluate(options: DictConfig) -> None:
     # Apart, so that they are measured again once its weights are there
     subfolder = "without_lpips" if measure.lpips is None else ""
     folders = target.folder, target.scene_folder / subfolder
-    scenes = measure_scenes(
-        tests, source.predict, measure, fabric.device, *folders, source.early_exit
-    )
+    extras = source.early_exit, source.costs
+    scenes = measure_scenes(tests, source.predict, measure, fabric.device, *folders, *extras)
     if options.write_gaussians is not None:
         folder = Path(options.write_gaussians)
         write_predictions(folder, tests[data.name], source.predict, fabric.device)
@@ -144,7 +151,7 @@ def open_source(
     elif system == "images":
         source = PredictionSource(open_images(Path(options.images), tests, fabric.device), ())
     else:
-        source = PredictionSource(make_refiner(options, measure, tests), ())
+        source = make_refiner(options, measure, tests)
     facts = {"tested/scenes": len(tests), **source.facts}
     return replace(source, sets=[data.name], facts=facts)
 
@@ -253,8 +260,16 @@ def open_images(folder: Path, tests: FixedTasks, device: torch.device) -> Predic
     return predict
 
 
-def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTasks) -> Predict:
+def make_refiner(
+    options: DictConfig, measure: PostOptimization, tests: FixedTasks
+) -> PredictionSource:
     """Return what refines a scene on its input views, from its sparse points or a plane sweep."""
+    costs: dict[str, float] = {}
+
+    def count(progress: RefinementProgress, _: object) -> bool:
+        costs["steps"] = float(progress.step)
+        return False
+
     settings = instantiate(options.refinement)
     function = refine_scaffold if isinstance(settings, ScaffoldSettings) else refine
     if options.refinement_steps is None:
@@ -271,12 +286,12 @@ def make_refiner(options: DictConfig, measure: PostOptimization, tests: FixedTas
             known = None if points is None else points.to(inputs.images.device)
             init = "plane_sweep" if known is None else "points"
             start = initial_gaussians(init, inputs, settings, known)
-            options_of_all = {"background": measure.background, "seed": options.seed}
-            return function(start, inputs, settings, **options_of_all, **limit)
+            of_all = {"background": measure.background, "seed": options.seed, "watch": count}
+            return function(start, inputs, settings, **of_all, **limit)
 
         return refined
 
-    return predict
+    return PredictionSource(predict, (), costs=costs)
 
 
 def write_predictions(

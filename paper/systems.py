@@ -105,6 +105,9 @@ def _describe(run: Run) -> str:
     text = f"{tested['scenes']} scenes of {data_text(tested['data'], tested.get('places'))}, "
     text += f"{tested['inputs']} input views of {tested['height']}x{tested['width']}, "
     text += f"metrics {tested['metrics.name']}, seed {run.seed}, {run.folder}"
+    if "cost/post0/steps" in run.results:
+        steps, seconds = (run.results[f"cost/post0/{name}"] for name in ("steps", "seconds"))
+        text = f"{steps:,.0f} steps in {seconds:.0f} s, {text}"
     if "residual" in tested:
         text += f", cameras fitted with a residual of {tested['residual']:.1%} at most"
     return text

@@ -144,7 +144,7 @@ def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     return _read(path, _to_rgb)
 
 
-def load_reduced(path: ImageFile, least: float) -> UInt8[ndarray, "h w 3"]:
+def load_reduced(path: ImageFile, least: float | int) -> UInt8[ndarray, "h w 3"]:
     """Read an image as `load_image`, but a JPEG at 1/8, 1/4 or 1/2 of its size, if that is enough.
 
     Decoding takes less time then. The first fraction is taken that leaves both sides a whole number

@@ -31,6 +31,7 @@ def measure_scenes(
     folder: Path,
     scene_folder: Path,
     early_exit: Mapping[str, float],
+    costs: Mapping[str, float],
 ) -> dict[str, list[SceneResult]]:
     """Measure every scene that has no result in `scene_folder` yet, with a progress bar.
 
@@ -40,6 +41,7 @@ def measure_scenes(
         folder: for figures/evaluation-post<steps>.png, which show the first scene at the first and
             the last of the steps.
         early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
+        costs: those of the last prediction besides seconds and memory.
     """
     make_folder(scene_folder, "paths.logs")
     make_folder(folder / "figures", "paths.logs")
@@ -64,6 +66,7 @@ def measure_scenes(
 
             result = measure(sample["scene"], predictor(sample), inputs, targets, show)
             result.early_exit.update(early_exit)
+            result.costs.get("post0", {}).update(costs)
             psnrs = [
                 f"{_means(result.rows, 'targets', method, 'images')['psnr']:.2f} dB"
                 + f" after {method[4:]} steps" * (method != "post0")
@@ -120,8 +123,8 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
 
     As test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
     baseline/<set>/<baseline>/<metric>, cost/gaussians, cost/post<steps>/seconds, see
-    `mean_but_longest`, and /gb, the largest, of further sets under cost/<set>/, and
-    early_exit/<set>/<what>.
+    `mean_but_longest`, /gb, the largest, and /steps of refinements, the mean, of further sets under
+    cost/<set>/, and early_exit/<set>/<what>.
     """
     averages: dict[str, float] = {}
     main = next(iter(scenes))
@@ -141,6 +144,9 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
             averages[f"{prefix}/{method}/seconds"] = mean_but_longest([r["seconds"] for r in rows])
             if all("gb" in row for row in rows):
                 averages[f"{prefix}/{method}/gb"] = max(row["gb"] for row in rows)
+            if all("steps" in row for row in rows):
+                steps = sum(row["steps"] for row in rows) / len(rows)
+                averages[f"{prefix}/{method}/steps"] = steps
     return averages
 
 

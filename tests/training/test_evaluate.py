@@ -314,6 +314,7 @@ def test_3dgs_is_fitted_to_each_test_scene(evaluate, composed):
     row = next(row for row in filled.rows if row.name.startswith("3DGS"))
     assert row.values["dl3dv/psnr"] == [psnr]
     assert row.values["inference_seconds"] == [found["cost/post0/seconds"]]
+    assert found["cost/post0/steps"] == 40 and "measured: 40 steps in " in row.note
 
 
 def test_scaffold_gs_is_drawn_view_by_view(evaluate):
