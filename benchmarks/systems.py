@@ -49,7 +49,7 @@ from paper.style import FAINT, OURS, PAPER, STYLE
 
 PUBLISHED_STEPS = 30_000  # of 3DGS and Scaffold-GS
 SPEEDS = ("fast", "balanced", "exact")  # of the network, see conf/speed
-NETWORK = "AsySplat, one pass"
+NETWORK = "plane-sweep model, one pass"
 TRACKED = TrackedMetrics(
     names=("scene", "system", "mark"),
     must_match=("photographs", "limit"),
@@ -71,14 +71,14 @@ class RefinedSystem:
 
 
 CURVES = {
-    "AsySplat, refined": RefinedSystem("network", DEFAULT),
+    "plane-sweep model, refined": RefinedSystem("network", DEFAULT),
     "plane sweep, refined": RefinedSystem("plane_sweep", DEFAULT),
     "3DGS": RefinedSystem(None, PUBLISHED_3DGS),
     "3DGS, cut": RefinedSystem(None, PUBLISHED_3DGS, cut=True),
     "Scaffold-GS": RefinedSystem(None, SCAFFOLD_GS),
     "Scaffold-GS, cut": RefinedSystem(None, SCAFFOLD_GS, cut=True),
 }
-COLORS = {NETWORK: OURS, "AsySplat, refined": OURS, "plane sweep, refined": "#101112"}
+COLORS = {NETWORK: OURS, "plane-sweep model, refined": OURS, "plane sweep, refined": "#101112"}
 COLORS |= {"3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}
 Measure = Callable[[Tensor], dict[str, float]]
 
