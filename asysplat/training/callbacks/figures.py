@@ -13,7 +13,12 @@ from asysplat.training.parallel import Batch, Prediction
 
 
 class Figures(Callback):
-    """Draws a `comparison_figure` of the first scenes of each validation and first test set."""
+    """Draws a `comparison_figure` of scenes of each validation and test, as the paper's Figure 5.
+
+    Args:
+        scenes: the first so many of the validation and of the data set's own test; of further test
+            sets one.
+    """
 
     def __init__(self, folder: str, scenes: int):
         self.folder, self.scenes = Path(folder) / "figures", scenes
@@ -27,7 +32,9 @@ class Figures(Callback):
         index: int,
         *_: object,
     ) -> None:
-        self._draw(trainer, "val", outputs, batch, index)
+        if index < self.scenes:
+            file = f"val-{index}-{trainer.global_step:06d}"
+            self._draw(trainer, file, f"val/{index}", outputs, batch)
 
     def on_test_batch_end(
         self,
@@ -38,13 +45,17 @@ class Figures(Callback):
         index: int,
         test_set: int = 0,
     ) -> None:
-        if test_set == 0:
-            self._draw(trainer, "test", outputs, batch, index)
+        name, count = "test", self.scenes
+        if test_set:
+            name, count = f"test-{list(trainer.datamodule.tests)[test_set]}", min(1, count)
+        if index < count:
+            self._draw(trainer, f"{name}-{index}", f"{name}/{batch['scene'][0]}", outputs, batch)
 
     def _draw(
-        self, trainer: Trainer, split: str, outputs: Prediction, batch: Batch, index: int
+        self, trainer: Trainer, file: str, name: str, outputs: Prediction, batch: Batch
     ) -> None:
-        if index >= self.scenes or not trainer.is_global_zero:
+        """Draw the first scene of a batch to a file, and to the loggers by a name."""
+        if not trainer.is_global_zero:
             return
         first = (
             record.map(lambda tensor: tensor[0].detach())
@@ -52,9 +63,7 @@ class Figures(Callback):
         )
         figure = comparison_figure(*first)
         self.folder.mkdir(parents=True, exist_ok=True)
-        step = "" if split == "test" else f"-{trainer.global_step:06d}"
-        figure.savefig(self.folder / f"{split}-{index}{step}.png", dpi=100)
-        name = f"{split}/{batch['scene'][0] if split == 'test' else index}"
+        figure.savefig(self.folder / f"{file}.png", dpi=100)
         for logger in trainer.loggers:
             log_figure(logger, name, figure, trainer.global_step)
 
