@@ -22,6 +22,8 @@ class Metrics(Callback):
 
     `results` holds the means of every test set, the protocol's descriptions, and the fractions that
     the network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
+    Rows of images are gathered, and not the sums of torchmetrics' classes, since processes may
+    repeat an image to have as many batches as the others, and the CSV has each image.
     """
 
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
