@@ -80,7 +80,10 @@ class Protocol:
         return targets.masked((rendered * 255).floor() / 255 if self.eight_bit else rendered)
 
     def depth_metrics(self, depth: Depths, targets: Views) -> dict[str, PerView]:
-        """Compute AbsRel and delta < 1.25 of each view; {} if the data has no depths."""
+        """Compute AbsRel and delta < 1.25 of each view, and AbsRel of depths scaled to the median.
+
+        {} if the data has no depths.
+        """
         if targets.depths is None:
             return {}
         target = targets.depths
@@ -89,6 +92,7 @@ class Protocol:
         return {
             "absrel": metrics.abs_rel(depth, target, self.depth_alignment),
             "delta1": metrics.delta1(depth, target, self.depth_alignment),
+            "absrel_median": metrics.abs_rel(depth, target, "median"),
         }
 
     def measure_views(
@@ -139,10 +143,8 @@ class Protocol:
         images = f"RGB in [0, 1], rendering clamped{cut}"
         by_scene = self.mean_over == "scenes"
         mean = "mean over a scene's images, then over scenes" if by_scene else "mean over images"
-        aligned = {
-            "none": "depth not aligned",
-            "median": "depth of each view scaled to the true median",
-        }[self.depth_alignment]
+        median = "depth of each view scaled to the true median"
+        aligned = {"none": "depth not aligned", "median": median}[self.depth_alignment]
         pixels = "the pixels of a view that its mask includes and whose depth is known"
         return {
             "name": self.name,
@@ -153,4 +155,5 @@ class Protocol:
             f"full resolution, {mean}",
             "absrel": f"mean of |d - t| / t over {pixels}, {aligned}, {mean}",
             "delta1": f"share with max(d/t, t/d) < 1.25 of {pixels}, {aligned}, {mean}",
+            "absrel_median": f"mean of |d - t| / t over {pixels}, {median}, {mean}",
         }
