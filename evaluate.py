@@ -75,7 +75,7 @@ class PredictionSource:
         facts: what its results depend on, in addition to the target's fingerprint.
         backgrounds: RGB [3] behind its scenes, by scene; the measure's own for the others.
         early_exit: fractions that the last prediction has skipped, changed by each.
-        costs: of the last prediction besides seconds and memory, changed by each.
+        costs: what the last prediction cost besides seconds and memory, changed by each.
     """
 
     predict: Predict

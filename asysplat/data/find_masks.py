@@ -44,7 +44,8 @@ def load_object_finder() -> Callable[[Views], Views]:
         pixels = (pixels / pixels.amax().clamp_min(LEAST) - mean) / std
         alpha = torch.from_numpy(session.run(None, {name: pixels.numpy()})[0])
         alpha = (alpha - alpha.amin()) / (alpha.amax() - alpha.amin()).clamp_min(LEAST)
-        return F.interpolate(alpha, image.shape[1:], mode="bilinear")[0, 0]
+        alpha = F.interpolate(alpha, image.shape[1:], mode="bilinear")[0, 0]
+        return (255 * alpha).round() / 255  # as files have it: what is nearly empty is empty
 
     def find_object(views: Views) -> Views:
         alphas = torch.stack([find_alpha(image) for image in views.images])

@@ -41,7 +41,7 @@ def measure_scenes(
         folder: for figures/evaluation-post<steps>.png, which show the first scene at the first and
             the last of the steps.
         early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
-        costs: those of the last prediction besides seconds and memory.
+        costs: what the last prediction cost besides seconds and memory.
     """
     make_folder(scene_folder, "paths.logs")
     make_folder(folder / "figures", "paths.logs")

@@ -84,8 +84,8 @@ def write_images(
     """Write a scene's renderings as `find_images` finds them, with targets and nearest inputs.
 
     Args:
-        folder: of the scene.
-        names: of the test views, see `view_names`.
+        folder: the scene's.
+        names: names of the test views, see `view_names`.
         rendered: [V, 3, H, W].
     """
     written = {

@@ -86,8 +86,9 @@ class Refinement:
         self.views = views.validate("refine's views")
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings = settings
-        behind = views.color_behind(views.mean_color())
-        self.background = behind if background is None else background
+        if background is None:
+            background = views.color_behind(views.mean_color())
+        self.background = background
         self._generator = torch.Generator(gaussians.means.device).manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates, views.images.device)

@@ -67,7 +67,7 @@ def test_a_set_has_the_same_numbers_as_alone(measure, together, name):
     )
     assert among_others == alone
     drawn_alone = run.folder / "figures" / "test-0.png"
-    suffix = "" if name == "procedural" else f"-{name}"  # of the further sets
+    suffix = "" if name == "procedural" else f"-{name}"  # further sets have their name
     drawn = together.folder / "figures" / f"test{suffix}-0.png"
     assert drawn.read_bytes() == drawn_alone.read_bytes()
 

@@ -91,7 +91,7 @@ def middle(height=24, width=32):
 def test_masks_that_leave_out_the_borders_are_of_an_object(few, tmp_path):
     folder = layout.write(few, tmp_path)
     for index in range(4):
-        save(middle(12, 16), folder / "mask" / f"{index:05d}.png")  # of half the size
+        save(middle(12, 16), folder / "mask" / f"{index:05d}.png")  # half the size
     views = opened(folder).views(range(4))
     assert views.masks is None and (views.alphas[:, 12, 16] > 0.9).all()
     assert (views.images[views.alphas[:, None].expand(-1, 3, -1, -1) == 0] == 1).all()
@@ -120,6 +120,18 @@ def test_other_kinds_of_alpha_are_read_or_named(few, tmp_path, mode):
     Image.open(image).convert(mode).save(image, format="tiff" if mode == "PA" else "png")
     alphas = opened(folder).views([0]).alphas
     assert torch.equal(alphas[0] == 1, half()) or mode == "P"  # a palette has one color for each
+
+
+@pytest.mark.parametrize("name", ["masks/00001.png", "images/00001.png"])
+def test_a_damaged_alpha_is_named(few, tmp_path, name):
+    folder = layout.write(few, tmp_path)
+    if name.startswith("masks"):
+        save(half(), folder / name)
+    else:
+        make_transparent(folder / name, half().float())
+    (folder / name).write_bytes((folder / name).read_bytes()[:60])
+    with pytest.raises(InputError, match=rf"{name} cannot be read as an image .*: copy it again"):
+        opened(folder).views([1])
 
 
 def test_a_mask_of_other_proportions_is_named(few, tmp_path):
