@@ -236,6 +236,23 @@ def test_pixelsplat_s_index_gives_inputs_and_targets(tmp_path):
         select_from_index(index, file, "5aca", 9, 2)
 
 
+def test_zipsplat_s_index_is_read_and_written_in_pixelsplat_s_form(tmp_path):
+    """Its images count from 0 in the order of a scene's photographs; some are input and target."""
+    file, ours = tmp_path / "ctx_3v_tgt_2v.json", tmp_path / "index.json"
+    file.write_text(
+        '{"bicycle": {"context": [0, 5, 11], "target": [1, 7]}, '
+        '"032dee9f": {"context": [2, 15, 24], "target": [0, 15]}}'
+    )
+    expected = {
+        "bicycle": Selection([0, 5, 11], [1, 7]),
+        "032dee9f": Selection([2, 15, 24], [0, 15]),
+    }
+    index = read_index(file, 3)
+    assert {name: select_from_index(index, file, name, 25, 3) for name in index} == expected
+    write_index(ours, expected)
+    assert json.loads(ours.read_text()) == json.loads(file.read_text())
+
+
 def test_long_lrm_s_lists_give_inputs_and_every_8th_target(tmp_path):
     for scene in "ab":
         content = {"scene_name": scene, "frames": [{}] * 20, "fold_8_kmeans_2_input": [3, 12]}

@@ -1,6 +1,9 @@
 """Index files, which name the images of each scene, in pixelSplat's form and in Long-LRM's.
 
+ZipSplat's indices have pixelSplat's form; that is why ours are written in it.
+
 https://github.com/dcharatan/pixelsplat/blob/main/assets/evaluation_index_re10k.json
+https://github.com/cvg/ZipSplat/tree/main/splatfactory/eval/indices
 https://github.com/arthurhero/Long-LRM/tree/main/data/example_data
 """
 
