@@ -16,7 +16,7 @@ from asysplat.errors import InputError
 
 NAMES = ("render", "ops", "model", "data", "formats", "pareto", "systems", "bench", "device")
 SUITES = {name: f"benchmarks.{name}" for name in NAMES}
-SUITES |= {name: f"benchmarks.{name}.report" for name in ("stability", "machine_code")}
+SUITES |= {name: f"benchmarks.{name}.report" for name in ("public", "stability", "machine_code")}
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 CPU = torch.device("cpu")
 

@@ -14,6 +14,7 @@ from statistics import fmean
 import matplotlib
 import torch
 from hydra.utils import instantiate
+from lpips import LPIPS
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
@@ -27,6 +28,8 @@ from asysplat import load
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.metrics import average as average_metrics
+from asysplat.evaluation.protocol import Protocol
 from asysplat.refinement import (
     DEFAULT,
     PUBLISHED_3DGS,
@@ -40,6 +43,7 @@ from asysplat.refinement import (
 )
 from asysplat.refinement.init import initial_gaussians
 from asysplat.rendering import render
+from asysplat.scene import Cameras, Views
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
 from benchmarks.options import check_names
 from benchmarks.pareto import NOISE_OF_SECONDS, FeedForward, find_scenes
@@ -80,7 +84,8 @@ CURVES = {
 }
 COLORS = {NETWORK: OURS, "plane-sweep model, refined": OURS, "plane sweep, refined": "#101112"}
 COLORS |= {"3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}
-Measure = Callable[[Tensor], dict[str, float]]
+Draw = Callable[[Cameras], Tensor]  # images of a scene, [V, 3, H, W]
+Measure = Callable[[Draw, bool], Result]  # the bool: whether it is the last time
 
 
 def measure(options: DictConfig, console: Console) -> Result:
@@ -105,11 +110,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     rows: list[Result] = []
     for scene_name, open_scene in scenes.items():
         photographs = open_scene(**config["photographs"])
-        targets = photographs.held_out
-
-        def quality(images: Tensor) -> dict[str, float]:
-            metrics = protocol.image_metrics(images, targets, lpips)  # noqa: B023, called at once
-            return {metric: values.mean().item() for metric, values in metrics.items()}
+        quality = partial(measure_quality, protocol, photographs.held_out, lpips)
 
         where = {"scene": scene_name, "photographs": config["photographs"], "limit": marks[-1]}
         for name in track(names, escape(scene_name), console=console, transient=True):
@@ -120,6 +121,17 @@ def measure(options: DictConfig, console: Console) -> Result:
             rows += [where | {"system": name} | row for row in found]
         console.print(f"{scene_name}: {len(names)} systems", highlight=False)
     return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}
+
+
+def measure_quality(
+    protocol: Protocol, targets: Views, lpips: LPIPS | None, draw: Draw, last: bool = True
+) -> dict[str, float]:
+    """Compute the means of the metrics over some views, which are drawn one by one."""
+    rows = []
+    for view in range(targets.num_views):
+        target = targets.select([view])
+        rows += protocol.measure_views(draw(target.cameras), None, target, lpips)
+    return average_metrics(rows, "images")
 
 
 @torch.no_grad()
@@ -138,7 +150,8 @@ def measure_network(photographs: Photographs, quality: Measure) -> list[Result]:
         seconds = time.perf_counter() - clock
         row = {"mark": speed, "seconds": seconds, "steps": None, "start": "network"}
         row |= {"gaussians": rendered.num_gaussians}
-        rows.append(row | quality(rendered.images))
+        images = iter(rendered.images[:, None])  # `quality` draws the held-out views in their order
+        rows.append(row | quality(lambda _: next(images), True))  # noqa: B023, called at once
     return rows
 
 
@@ -146,25 +159,27 @@ def measure_refinement(
     photographs: Photographs, curve: RefinedSystem, marks: Sequence[float], quality: Measure
 ) -> list[Result]:
     """Measure a refinement after each mark, in seconds."""
-    settings, inputs, cameras = curve.settings, photographs.inputs, photographs.held_out.cameras
+    settings, inputs = curve.settings, photographs.inputs
     start = curve.start or ("plane_sweep" if photographs.points is None else "points")
     network = load("shipped") if start == "network" else None
     clock = time.perf_counter()
     gaussians = initial_gaussians(start, photographs.inputs, settings, photographs.points, network)
     before = time.perf_counter() - clock
-    background, rows, due = inputs.mean_color(), [], list(marks)
+    background, rows, due = photographs.background, [], list(marks)
 
     def watch(progress: RefinementProgress, refinement) -> bool:
         ended = progress.fraction == 1  # maybe before the last mark
         reached = [mark for mark in due if ended or progress.seconds >= mark]
         if reached:
-            with torch.no_grad():
-                if isinstance(refinement, Refinement):
-                    image = render(refinement.gaussians, cameras, background, depth=False).image
-                else:
-                    image = refinement.scene.render(cameras, background, depth=False).image
+            if isinstance(refinement, Refinement):
+                draw = partial(render, refinement.gaussians)
+            else:
+                draw = refinement.scene.render
             row = {"seconds": before + progress.seconds, "steps": progress.step, "start": start}
-            row |= {"gaussians": progress.gaussians, "noise": NOISE_OF_SECONDS} | quality(image)
+            row |= {"gaussians": progress.gaussians, "noise": NOISE_OF_SECONDS}
+            last = len(reached) == len(due)
+            with torch.no_grad():
+                row |= quality(lambda cameras: draw(cameras, background, depth=False).image, last)
             rows.extend({"mark": mark} | row for mark in reached)
             del due[: len(reached)]
         return not due

@@ -157,8 +157,25 @@ def open_photographs(
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
         scene = _with_chosen_cameras(scene, sorted((*inputs, *held_out)), cameras, say)
+    return load_photographs(scene, inputs, held_out, height, width, background, find_object, say)
+
+
+def load_photographs(
+    scene: PosedScene,
+    inputs: list[int],
+    held_out: list[int],
+    height: int,
+    width: int,
+    background: Background = "auto",
+    find_object: Callable[[Views], Views] | None = None,
+    say: Callable[[str], None] = print,
+) -> Photographs:
+    """Read the photographs of a scene at these indices, and bring them into the network's frame.
+
+    `held_out` may be empty; the other options are those of `open_photographs`.
+    """
     sequence = FileSequence(scene, SceneOptions(height, width))
-    both = [sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1])]
+    both = [sequence.views(each).validate(scene.name) for each in (inputs, held_out or inputs[:1])]
     if find_object is not None and not _transparent_share(both[0]):
         both = [find_object(views) for views in both]
     input_views, targets, normalization = normalize(*both)
@@ -175,7 +192,7 @@ def open_photographs(
         points=normalized_points(scene.points, normalization),
         total=len(scene.images),
         origin=scene.origin,
-        is_split=bool(published),
+        is_split=bool(scene.held_out),
     )
 
 

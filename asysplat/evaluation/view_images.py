@@ -60,7 +60,10 @@ def find_images(folder: Path, tasks: Sequence[Task]) -> dict[str, list[Path]]:
             f"{option} has no folder of {len(missing)} of the {len(names)} scenes, "
             f"{list_names(missing)}: add them, or leave these scenes out of the data."
         )
-    return {task.sequence.name: _images_of(folder / task.sequence.name, task) for task in tasks}
+    return {
+        task.sequence.name: find_view_files(folder / task.sequence.name, view_names(task))
+        for task in tasks
+    }
 
 
 def read_images(paths: Sequence[Path], height: int, width: int) -> ViewImages:
@@ -114,12 +117,11 @@ def view_names(task: Task) -> list[str]:
     return [names[index] for index in targets]
 
 
-def _images_of(folder: Path, task: Task) -> list[Path]:
-    """Find the image of each test view of a scene."""
+def find_view_files(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Find the image of each test view of a scene, in a folder, by the views' names."""
     files: dict[str, list[Path]] = {}
     for path in images_in(folder):
         files.setdefault(path.stem, []).append(path)
-    names = view_names(task)
     if missing := {name for name in names if name not in files}:
         raise InputError(
             f"{folder} has no image of {len(missing)} of the {len(names)} test views, "

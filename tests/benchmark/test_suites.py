@@ -175,7 +175,7 @@ def test_a_refinement_is_measured_as_it_is_after_its_last_step(tmp_path):
     curve = systems.RefinedSystem("plane_sweep", systems.CURVES["3DGS"].settings, cut=True)
     seen, color = [], views.mean_color()
     (*_, row) = systems.measure_refinement(
-        photographs, curve, [0.05], lambda image: seen.append(image) or {}
+        photographs, curve, [0.05], lambda picture, _: seen.append(picture(cameras)) or {}
     )
     refined = refine(
         initial_gaussians("plane_sweep", views, curve.settings),

@@ -25,7 +25,8 @@ PARTS = {"model=asysplat", "model=blocks", "model=one_branch", "data=views", "da
 CHOICES = {
     f"{path.parent.relative_to(CONF)}={path.stem}"
     for path in CONF.rglob("*.yaml")
-    if path.parent not in (CONF, CONF / "refinement", CONF / "quality", SWEEPS)
+    if path.parent
+    not in (CONF, *(CONF / each for each in ("refinement", "quality", "public")), SWEEPS)
 }
 CHOICES = sorted(CHOICES - PARTS)
 STAGES = ("stage1", "stage2", "stage3", "ablation")

@@ -1,0 +1,1 @@
+"""Measure refinements on published scenes, in the protocols in which others publish numbers."""
