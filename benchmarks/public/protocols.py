@@ -65,9 +65,9 @@ class SceneProtocol:
         """Build the metrics."""
         return instantiate(OmegaConf.load(CONF / "metrics" / f"{self.metrics}.yaml"))
 
-    def describe(self, scene: str) -> dict[str, Any]:
-        """Return all that a scene's numbers depend on but the refinement."""
-        return asdict(self) | {"scenes": self.scenes[scene], "of": self.read_metrics().describe()}
+    def describe(self) -> dict[str, Any]:
+        """Return all that numbers depend on but what fits the scenes."""
+        return asdict(self) | {"metrics": self.read_metrics().describe()}
 
 
 def read_protocols() -> dict[str, SceneProtocol]:

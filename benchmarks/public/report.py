@@ -67,8 +67,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     """Measure the systems of `options.public` on all published scenes that `data.root` has.
 
     Returns:
-        "rows": one for each protocol, scene, system and mark. "not_measured": the reason for what
-        was not measured.
+        "rows": one for each protocol, scene, system and mark. "protocols": what each row's numbers
+        depend on, by name. "not_measured": the reason for what was not measured.
     """
     config: Any = OmegaConf.to_container(options.public, resolve=True)
     known = read_protocols()
@@ -100,7 +100,8 @@ def measure(options: DictConfig, console: Console) -> Result:
             absent[f"LPIPS, {protocol.title}"] = measured.metrics.without_lpips()
     if not rows:
         raise InputError("; ".join(absent.values()))
-    return {"rows": rows, "not_measured": absent}
+    used = {row["protocol"]: known[row["protocol"]].describe() for row in rows}
+    return {"protocols": used, "not_measured": absent, "rows": rows}
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class PublishedScene:
     def rows(self, name: str, system: RefinedSystem) -> list[Result]:
         """Measure a system after each mark, or read what was measured."""
         marks, scene = self.config["marks"], self.folder.name
-        of = {"protocol": self.protocol.describe(scene), "folder": str(self.folder), "marks": marks}
+        of = {"protocol": self.protocol.describe(), "folder": str(self.folder), "marks": marks}
         of |= {"system": repr(system), "revision": revision(), "lpips": self.lpips is not None}
         fingerprint = hashlib.blake2b(json.dumps(of).encode(), digest_size=4).hexdigest()
         path = self.kept / f"{self.protocol.name}-{scene}-{fingerprint}.json"
