@@ -148,10 +148,8 @@ class PublishedScene:
         def quality(draw: Draw, last: bool) -> Result:
             return self._measure(targets if last else some, draw)
 
-        baseline = nearest_view_images(photographs.inputs, targets)
-        rows = [
-            self._row("nearest input, copied", None) | self._measure(targets, in_turn(baseline))
-        ]
+        nearest = in_turn(nearest_view_images(photographs.inputs, some))
+        rows = [self._row("nearest input, copied", None) | self._measure(some, nearest)]
         # A refinement that ends early has the same row at all later marks.
         found = {
             row["steps"]: row for row in measure_refinement(photographs, system, marks, quality)
@@ -221,7 +219,7 @@ def tables(results: Result) -> list[Table]:
         used |= {row["source"].partition(",")[0] for row in rows if "source" in row}
         views = sorted({row["views"] for row in rows if "views" in row})
         if len(views) > 1:
-            notes.append(f"before the last mark {views[0]} of the {views[-1]} images are measured")
+            notes.append(f"own rows but the last are of {views[0]} of the {views[-1]} images")
         shown.append(make_table(title, COLUMNS, rows, "\n".join(notes)))
     absent = [f"not measured: {name}: {why}" for name, why in results["not_measured"].items()]
     own = f"own rows: {machine_text(results)}, revision {results['revision']}"
