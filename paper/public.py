@@ -18,7 +18,7 @@ class PublishedRow:
     source: str  # name in `published_sources`
     ssim: Number | None = None
     lpips: Number | None = None
-    seconds: Number | None = None  # of the training
+    seconds: Number | None = None  # duration of the training
     hardware: str | None = None
     scenes: int | None = None  # how many the numbers are the mean of; None for one scene
 

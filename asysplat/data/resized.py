@@ -50,7 +50,7 @@ def _as_copy(image: PosedImage, copy: Path, size: tuple[int, int]) -> PosedImage
     if (found := image_size(copy)) != size:
         raise InputError(
             f"{copy} is {found[0]} x {found[1]} and others in its folder {size[0]} x {size[1]}: "
-            "copy the folder again as it was published, or set another data.height."
+            "copy the folder again as it was published."
         )
     mask = copy if image.mask == image.file else image.mask  # where it is transparent
     return replace(image, file=copy, lens=scale_lens(image.lens, size, str(copy)), mask=mask)
