@@ -6,11 +6,14 @@ from matplotlib.axes import Axes
 
 from paper.style import FAINT, INK
 
-Point = tuple[str, float, float]  # name, cost, quality
+Point = tuple[str, float | int, float | int]  # name, cost, quality
 # Where a name is beside its point: offset in typographic points, alignments.
 ABOVE, BELOW = ((0, 6), "center", "bottom"), ((0, -6), "center", "top")
 LEFT, RIGHT = ((-7, 0), "right", "center"), ((7, 0), "left", "center")
 ABOVE_LEFT, ABOVE_RIGHT = ((0, 6), "right", "bottom"), ((0, 6), "left", "bottom")
+AROUND = (BELOW, ABOVE, RIGHT, LEFT)
+Place = tuple[tuple[int, int], str, str]
+Name = tuple[Point, str, Sequence[Place]]  # the point that has it, its color, places in order
 FONT = 9
 
 
@@ -48,22 +51,28 @@ def draw_front(
         face = "none" if point[0] in hollow else own
         axes.plot(*point[1:], "o", color=own, mfc=face, ms=6 if point in rest else 7, alpha=alpha)
     axes.margins(x=0.2, y=0.18)
-    axes.figure.draw_without_rendering()  # fixes the points' places in pixels
-    labels = []
+    names: list[Name] = []
     for point in front:
         first = ABOVE_RIGHT if point == front[-1] else ABOVE_LEFT
-        labels.append((point, INK, (first, LEFT, RIGHT, BELOW, first)))
-    labels += [(point, FAINT, (BELOW, ABOVE, RIGHT, LEFT)) for point in rest]
+        names.append((point, INK, (first, LEFT, RIGHT, BELOW, first)))
+    draw_names(axes, names + [(point, FAINT, AROUND) for point in rest], FONT)
+
+
+def draw_names(axes: Axes, names: Sequence[Name], font: float | int) -> None:
+    """Write names beside their points, the first ones first, each at its first place with room.
+
+    A name without room is left out, unless its last place repeats an earlier one.
+    """
+    axes.figure.draw_without_rendering()  # fixes the points' places in pixels
     occupied = []
-    for (name, *position), ink, places in labels:
+    for (name, *position), ink, places in names:
         for number, place in enumerate(places):
             offset, ha, va = place
             text = axes.annotate(
                 name, position, offset, textcoords="offset points", ha=ha, va=va, color=ink,
-                fontsize=FONT,
+                fontsize=font,
             )  # fmt: skip
             box = text.get_window_extent()
-            # The last place of a point on the front, which repeats the first, is always taken.
             if not any(map(box.overlaps, occupied)) or place in places[:number]:
                 occupied.append(box)
                 break

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import torch
 from hydra.utils import instantiate
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from omegaconf import DictConfig, OmegaConf
@@ -28,12 +30,14 @@ from torch import Tensor, nn
 from asysplat.data.photographs import Photographs
 from asysplat.data.selection import evenly_spaced
 from asysplat.errors import InputError
+from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import nearest_view_images
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.view_images import find_view_files, read_images
 from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.refinement import PUBLISHED_3DGS, SCAFFOLD_GS
+from asysplat.rendering import Rendering
 from asysplat.runs.machine import revision
 from asysplat.scene import Views
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
@@ -47,6 +51,7 @@ from benchmarks.public.protocols import (
 from benchmarks.systems import Draw, RefinedSystem, measure_quality, measure_refinement
 from benchmarks.table import Columns, machine_text, make_table, number_column, text_column
 from benchmarks.timing import Result
+from paper.front import AROUND, RIGHT, Name, draw_names
 from paper.public import PublishedRow, published_rows, published_sources
 from paper.style import FAINT, INK, OURS, PAPER, STYLE
 
@@ -60,6 +65,7 @@ TRACKED = TrackedMetrics(
     kinds={"psnr": DECIBELS, "lpips": LPIPS_DISTANCE},
 )
 CURVES = (OURS, INK, "#2f8f4e", "#7a3fb0", FAINT)  # colors of what was measured
+PICTURES = 3  # held-out views that are drawn
 PANELS = 3  # in a row of the figure
 
 
@@ -131,7 +137,7 @@ class PublishedScene:
         return photographs, {"images": images, "reading": time.perf_counter() - clock}
 
     def rows(self, name: str, system: RefinedSystem) -> list[Result]:
-        """Measure a system after each mark, or read what was measured."""
+        """Measure a system after each mark and draw its end, or read what was measured."""
         marks, scene = self.config["marks"], self.folder.name
         of = {"protocol": self.protocol.describe(), "folder": str(self.folder), "marks": marks}
         of |= {"system": repr(system), "revision": revision(), "lpips": self.lpips is not None}
@@ -146,6 +152,8 @@ class PublishedScene:
         some = targets.select(evenly_spaced(range(targets.num_views), count))
 
         def quality(draw: Draw, last: bool) -> Result:
+            if last:
+                draw_views(path.with_suffix(".png"), photographs, draw)
             return self._measure(targets if last else some, draw)
 
         nearest = in_turn(nearest_view_images(photographs.inputs, some))
@@ -181,6 +189,17 @@ class PublishedScene:
     def _measure(self, views: Views, draw: Draw) -> Result:
         count = {"views": views.num_views}
         return count | measure_quality(self.metrics, views, self.lpips, draw)
+
+
+def draw_views(path: Path, photographs: Photographs, draw: Draw) -> None:
+    """Draw some held-out views beside their photographs."""
+    targets = photographs.held_out
+    some = targets.select(evenly_spaced(range(targets.num_views), min(PICTURES, targets.num_views)))
+    image = torch.cat([draw(some.cameras.select([view])) for view in range(some.num_views)])
+    rendering = Rendering(image, torch.ones_like(image[:, 0]), depth=None, stats={})
+    with atomic_write(path) as partial_path:
+        figure = comparison_figure(photographs.inputs, some, rendering)
+        figure.savefig(partial_path, format="png", dpi=200)
 
 
 def in_turn(images: Tensor) -> Draw:
@@ -241,28 +260,43 @@ def plot(results: Result) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(1.0 + 5.4 * columns, 4.4 * lines), layout="constrained")
         grid = figure.subplots(lines, columns, squeeze=False).flat
+        names = {}
         for axes, (protocol, scene) in zip(grid, scenes, strict=False):
-            rows = merged_rows(results["rows"], protocol, scene)
-            rows = [row for row in rows if row.get("seconds")]
-            published = [row for row in rows if row["mark"] is None]
-            for row in published:
-                axes.plot(row["seconds"], row["psnr"], "x", color=PAPER)
-                place = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 7}
-                axes.annotate(row["method"], (row["seconds"], row["psnr"]), color=FAINT, **place)
-            measured = dict.fromkeys(row["method"] for row in rows if row["mark"])
-            for name, color in zip(measured, CURVES, strict=False):
-                points = [(r["seconds"], r["psnr"]) for r in rows if r["method"] == name]
-                axes.plot(*zip(*sorted(points), strict=True), "-o", ms=4, color=color, label=name)
-            axes.set(title=f"{protocols[protocol].title}: {scene}", xscale="log")
-            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            names[axes] = _plot_rows(axes, merged_rows(results["rows"], protocol, scene))
+            axes.set_title(f"{protocols[protocol].title}: {scene}")
+        for axes, those in names.items():
+            draw_names(axes, those, 7)
         figure.axes[0].legend(frameon=False, fontsize=9)
-        seconds = "seconds: lines on this machine's CPU, crosses as published, on GPUs"
+        seconds = "seconds: dots on this machine's CPU, crosses and lines as published, on GPUs"
         figure.supxlabel(seconds, color=FAINT)
         figure.supylabel("PSNR of held-out images, dB")
         for axes in figure.axes[len(scenes) :]:
             axes.remove()
     return figure
+
+
+def _plot_rows(axes: Axes, rows: Sequence[Result]) -> list[Name]:
+    """Plot the rows of a scene; return the names of published ones, still to be drawn."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.margins(0.08)
+    own = [row for row in rows if row["mark"]]
+    for name, color in zip(dict.fromkeys(row["method"] for row in own), CURVES, strict=False):
+        points = [(row["seconds"], row["psnr"]) for row in own if row["method"] == name]
+        axes.plot(*zip(*sorted(points), strict=True), "-o", ms=4, color=color, label=name)
+    first, last = (choose(row["seconds"] for row in own) for choose in (min, max))
+    names: list[Name] = []
+    for row in (row for row in rows if "source" in row):
+        seconds, level = row["seconds"], row["psnr"]
+        if seconds is None:  # a level, named on the right of what was measured
+            axes.hlines(level, first, last, color=PAPER, lw=0.5)
+            axes.set_xlim(right=last * last / first)
+            names.append(((row["method"], last, level), FAINT, (RIGHT,)))
+        else:
+            axes.plot(seconds, level, "x", color=PAPER)
+            names.append(((row["method"], seconds, level), FAINT, AROUND))
+    return names
 
 
 COLUMNS: Columns = {

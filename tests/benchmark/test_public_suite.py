@@ -80,6 +80,7 @@ def test_our_rows_stand_between_published_ones_and_are_kept(
     assert [row["mark"] for row in first["rows"]] == [None, 0.05, 0.1] and len(opened) == 1
     assert [row["views"] for row in first["rows"]] == [1, 1, 2]
     assert first["rows"][0]["psnr"] < first["rows"][-1]["psnr"]
+    assert len(list((tmp_path / "public").glob("small-fern-*.png"))) == 1
     again = report.measure(options, Console(quiet=True))
     assert again == first and len(opened) == 1  # nothing is measured again
     changed[0] = replace(SMALL, metrics="longlrm")
@@ -100,4 +101,5 @@ def test_our_rows_stand_between_published_ones_and_are_kept(
     assert methods[:2] == ["copier", "Best"] and methods[-1] == "Worst"
     (table,) = report.tables(results)
     assert list(table.columns[0].cells) == methods and "nerfbaselines" not in table.caption
-    assert len(report.plot(results).axes) == 1
+    (axes,) = report.plot(results).axes
+    assert [text.get_text() for text in axes.texts] == ["Best", "Worst"]
