@@ -41,7 +41,13 @@ from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import find_views
-from asysplat.refinement import RefinementSettings, ScaffoldSettings, refine, refine_scaffold
+from asysplat.refinement import (
+    RefinementSettings,
+    ScaffoldSettings,
+    for_views,
+    refine,
+    refine_scaffold,
+)
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
 from asysplat.runs.machine import find_device
@@ -73,6 +79,12 @@ def reconstruct(config: DictConfig) -> None:
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
+    if "refinement" not in given_options():
+        given = [name.partition("refinement.")[2] for name in given_options()]
+        few = for_views(config.refinement, photographs.inputs.num_views, filter(None, given))
+        if few != config.refinement:
+            print("few photographs: refinement=few; to avoid it, refinement=default")
+            config.refinement, settings = few, instantiate(few)
     # an error of names comes before the work
     find_views(config.video, photographs.input_files, photographs.held_out_files)
     print(describe(config, photographs, limit))

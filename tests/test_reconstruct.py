@@ -32,6 +32,7 @@ from asysplat.errors import InputError
 from asysplat.export import write_ply
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.results import save_gaussians
+from asysplat.refinement import DEFAULT, FEW
 from asysplat.root import CONF
 from asysplat.runs.runs import find_reconstructions
 
@@ -101,7 +102,7 @@ def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, mo
         assert name == "auto"
         return DEVICE
 
-    options = ("steps=3", "refinement.max_gaussians=300", "views=4", "height=24")
+    options = ("steps=3", "refinement.max_gaussians=300", "views=10", "height=24")
     options += ("video.path=orbit", f"init={init}")
     finished(command(photographs, *options))
     expected = numbers_of(tmp_path / "run")
@@ -387,7 +388,11 @@ def test_odd_paths_and_the_end_by_max_steps_per_image(command, photographs, tmp_
     path = tmp_path / "it's \"a=b\", [c] \\'scene\\"
     path.symlink_to(photographs)
     said = finished(command(path, "views=3", "video.path=none", *limit))
-    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["path"] == str(path)
+    used = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    assert used["path"] == str(path)
+    assert "few photographs: refinement=few" in said
+    assert used["refinement"]["opacity_decay"] == FEW.opacity_decay < 1
+    assert used["refinement"]["max_steps_per_image"] == 2 != DEFAULT.max_steps_per_image
     assert "ended after refinement.max_steps_per_image=2" in said
     assert numbers_of(tmp_path / "run")["steps"] == 6
 

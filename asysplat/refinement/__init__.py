@@ -10,14 +10,17 @@ from asysplat.refinement.scaffold_gs import (
 )
 from asysplat.refinement.settings import (
     DEFAULT,
+    FEW,
     PAPER,
     PUBLISHED_3DGS,
     RefinementSettings,
     StepSchedule,
+    for_views,
 )
 
 __all__ = [
     "DEFAULT",
+    "FEW",
     "PAPER",
     "PUBLISHED_3DGS",
     "SCAFFOLD_GS",
@@ -27,6 +30,7 @@ __all__ = [
     "RefinementSettings",
     "ScaffoldSettings",
     "StepSchedule",
+    "for_views",
     "merge_to_limit",
     "refine",
     "refine_scaffold",

@@ -13,6 +13,7 @@ from asysplat.refinement.settings import Rates
 from asysplat.scene import Cameras, Gaussians
 
 MAX_SH_DEGREE = 3
+LOGIT_EPS = 1e-6
 Parameters = dict[str, Tensor]
 
 
@@ -84,6 +85,11 @@ class Fields:
         logits.clamp_(max=math.log(greatest / (1 - greatest)))
         self.optimizer.reset("logits")
 
+    def decay_opacities(self, factor: float) -> None:
+        """Multiply all opacities by a factor."""
+        logits = self.parameters["logits"]
+        logits.copy_((factor * logits.sigmoid()).logit(eps=LOGIT_EPS))
+
     def keep(self, index: Int[Tensor, "M"]) -> None:
         """Keep the rows of `index`."""
         self.optimizer.keep(index)
@@ -107,7 +113,7 @@ class Fields:
             "offsets": torch.zeros_like(gaussians.means),
             "quats": gaussians.quats,
             "log_scales": gaussians.scales.log(),
-            "logits": gaussians.opacities.clamp(1e-6, 1 - 1e-6).logit(),
+            "logits": gaussians.opacities.logit(eps=LOGIT_EPS),
             "sh": torch.cat((sh, missing), dim=1),
         }
 

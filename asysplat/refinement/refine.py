@@ -141,6 +141,8 @@ class Refinement:
         means_alone = settings.decay_means_alone
         visible = self.fields.step(gradients, settings.rates, factor, means_alone, degree)
         self._densifier.observe_step(visible, factor)
+        if settings.opacity_decay < 1 and progress < 1 - cool_down:
+            self.fields.decay_opacities(settings.opacity_decay)
         self._steps += 1
         return error
 

@@ -2,10 +2,11 @@
 
 import math
 import sys
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -43,7 +44,7 @@ class StepSchedule:
 
 @dataclass(frozen=True, config=configured("refinement"))
 class RefinementSettings:
-    """Settings of a refinement; `DEFAULT` is ours, `PAPER` the paper's post-optimization.
+    """Settings of a refinement; `DEFAULT` is ours, `FEW` for few views, `PAPER` the paper's.
 
     Raises:
         pydantic.ValidationError: a number out of range.
@@ -56,12 +57,14 @@ class RefinementSettings:
 
     rates: Rates
     ssim: NotNegative | None
+    few_views: Index
     views_per_step: Count | None
     sh_degree: Annotated[int, Field(ge=0, le=3)] | None
     half_resolution_until: Fraction
     densify: Literal["error", "mcmc", "gradient", "none"]
     max_gaussians: Count | None
     initial_fraction: Fraction
+    opacity_decay: Fraction
     densify_rounds: Index
     densify_until: Fraction
     every: StepSchedule | None
@@ -102,6 +105,23 @@ def read_settings(*names: str) -> Any:
     return instantiate(config)
 
 
+def for_views(config: DictConfig, num_views: int, given: Iterable[str] = ()) -> DictConfig:
+    """Return the options of a refinement for so many views: for few, those of conf/refinement/few.
+
+    Args:
+        given: names of the options that stay.
+    """
+    if num_views > config.get("few_views", 0):
+        return config
+    options: Any = OmegaConf.load(CONF / "refinement" / "few.yaml")
+    del options["defaults"]
+    few: Any = OmegaConf.merge(config, options)
+    for name in given:
+        OmegaConf.update(few, name, OmegaConf.select(config, name))
+    return few
+
+
 DEFAULT: RefinementSettings = read_settings("default")
 PAPER: RefinementSettings = read_settings("default", "paper")
+FEW: RefinementSettings = read_settings("default", "few")
 PUBLISHED_3DGS: RefinementSettings = read_settings("default", "3dgs")

@@ -8,6 +8,7 @@ goes on where it was.
 import hashlib
 import json
 import math
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -36,7 +37,7 @@ from asysplat.evaluation.metrics import nearest_view_images
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.view_images import find_view_files, read_images
 from asysplat.files import atomic_write, make_folder, read_json
-from asysplat.refinement import PUBLISHED_3DGS, SCAFFOLD_GS
+from asysplat.refinement import PUBLISHED_3DGS, SCAFFOLD_GS, for_views
 from asysplat.rendering import Rendering
 from asysplat.runs.machine import revision
 from asysplat.scene import Views
@@ -80,9 +81,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     known = read_protocols()
     names = list(known) if config["protocols"] == "all" else config["protocols"]
     check_names("public.protocols", names, [*known, "all"])
-    settings = instantiate(OmegaConf.merge(options.refinement, config["ours"]))
-    systems = {"asysplat": RefinedSystem("plane_sweep", settings)} | OTHERS
-    check_names("public.systems", config["systems"], systems)
+    check_names("public.systems", config["systems"], ["asysplat", *OTHERS])
     if options.data.root is None:
         raise InputError("data.root is null: name a folder of published scenes (data/README.md).")
     found = find_folders(Path(options.data.root), [known[name] for name in names])
@@ -95,6 +94,9 @@ def measure(options: DictConfig, console: Console) -> Result:
     absent: dict[str, str] = {}
     for protocol, scene, folder in found:
         measured = PublishedScene(protocol, folder, config, console, kept)
+        views = sys.maxsize if protocol.views == "all" else protocol.views
+        ours = OmegaConf.merge(for_views(options.refinement, views), config["ours"])
+        systems = {"asysplat": RefinedSystem("plane_sweep", instantiate(ours))} | OTHERS
         try:
             for system in config["systems"]:
                 rows += measured.rows(system, systems[system])

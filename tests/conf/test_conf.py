@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.refinement import DEFAULT, PAPER, PUBLISHED_3DGS, SCAFFOLD_GS
+from asysplat.refinement import DEFAULT, FEW, PAPER, PUBLISHED_3DGS, SCAFFOLD_GS
 from paper.tables import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def test_a_choice_composes_and_builds_its_model(build, choice):
 
 def test_hydra_and_the_code_read_the_same_refinements(composed):
     names = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
-    coded = {"default": DEFAULT, "paper": PAPER, "3dgs": PUBLISHED_3DGS}
+    coded = {"default": DEFAULT, "few": FEW, "paper": PAPER, "3dgs": PUBLISHED_3DGS}
     coded |= {"scaffold_gs": SCAFFOLD_GS}
     assert names == coded.keys()
     for name, expected in coded.items():

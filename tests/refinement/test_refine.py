@@ -8,6 +8,8 @@ from itertools import pairwise
 
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from pydantic import ValidationError
 from test_init import front_views
 
@@ -15,11 +17,13 @@ from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import (
     DEFAULT,
+    FEW,
     PAPER,
     PUBLISHED_3DGS,
     SCAFFOLD_GS,
     Refinement,
     StepSchedule,
+    for_views,
     refine,
 )
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
@@ -27,6 +31,7 @@ from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import correct_poses
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.rendering import render
+from asysplat.root import CONF
 from asysplat.scene import Gaussians, Views
 
 NAMES = [field.name for field in fields_of(Gaussians)]
@@ -267,6 +272,24 @@ def test_rates_cool_down_at_the_end_and_only_that_of_means_in_3dgs():
     assert color_steps(settings) == pytest.approx(expected, rel=0.02)
     settings = replace(PUBLISHED_3DGS, rates=replace(rates, means=1e-9, unit="scene"))
     assert color_steps(settings) == pytest.approx([1e-4] * 19, rel=0.02)
+
+
+def test_few_views_have_their_own_options_but_for_the_given_ones():
+    files = (CONF / "refinement" / f"{name}.yaml" for name in ("default", "paper"))
+    default, paper = map(OmegaConf.load, files)
+    assert for_views(default, 10) == default and for_views(paper, 1) == paper
+    assert instantiate(for_views(default, 9)) == FEW
+    given = OmegaConf.merge(default, {"ssim": 0.7, "rates": {"means": 0.1}})
+    few = instantiate(for_views(given, 3, ["ssim", "rates.means"]))
+    assert few == replace(FEW, ssim=0.7, rates=replace(FEW.rates, means=0.1))
+
+
+def test_opacities_decay_until_the_rates_cool_down():
+    rates = replace(DEFAULT.rates, opacities=0.0)
+    settings = replace(DEFAULT, rates=rates, densify="none", opacity_decay=0.9, cool_down=0.5)
+    start = small_scene()
+    refined = refine(start, small_views(), settings, steps=8)
+    torch.testing.assert_close(refined.opacities, 0.9**4 * start.opacities)
 
 
 def test_3dgs_densifies_resets_opacities_and_adds_sh_degrees_at_its_steps():
