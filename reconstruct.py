@@ -80,7 +80,7 @@ def reconstruct(config: DictConfig) -> None:
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
     if "refinement" not in given_options():
-        given = [name.partition("refinement.")[2] for name in given_options()]
+        given = (name.partition("refinement.")[2] for name in given_options())
         few = for_views(config.refinement, photographs.inputs.num_views, filter(None, given))
         if few != config.refinement:
             print("few photographs: refinement=few; to avoid it, refinement=default")
