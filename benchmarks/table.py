@@ -28,7 +28,8 @@ def make_table(
     """Make a table with a line for each row; its first `names` columns are aligned left."""
     table = Table(title=title, caption=notes, box=ROUNDED)
     for number, heading in enumerate(columns):
-        table.add_column(heading, justify="left" if number < names else "right", no_wrap=True)
+        name = number < names  # only names are wrapped where the terminal is narrow
+        table.add_column(heading, justify="left" if name else "right", no_wrap=not name)
     for row in rows:
         table.add_row(*(write(row) for write in columns.values()))
     return table
