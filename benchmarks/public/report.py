@@ -287,7 +287,8 @@ def _plot_rows(axes: Axes, rows: Sequence[Result]) -> list[Name]:
     for name, color in zip(dict.fromkeys(row["method"] for row in own), CURVES, strict=False):
         points = [(row["seconds"], row["psnr"]) for row in own if row["method"] == name]
         axes.plot(*zip(*sorted(points), strict=True), "-o", ms=4, color=color, label=name)
-    first, last = (choose(row["seconds"] for row in own) for choose in (min, max))
+    measured = [row["seconds"] for row in own]
+    first, last = min(measured), max(measured)
     names: list[Name] = []
     for row in (row for row in rows if "source" in row):
         seconds, level = row["seconds"], row["psnr"]
