@@ -5,18 +5,21 @@ from collections.abc import Mapping, Sequence
 import torch
 from matplotlib.figure import Figure
 
-from asysplat.evaluation.metrics import BASELINES, nearest_view_images, psnr
+from asysplat.evaluation.metrics import BASELINES, known_depths, nearest_view_images, psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views, inverse_depths
 
-MAX_ERROR = 0.5  # at the bright end of the color map
+DEPTH_ERROR = "depth error, 0 to 0.25"  # |d - t| / t
+ERRORS = {"error": 0.5, DEPTH_ERROR: 0.25}  # title: at the bright end of the color map
 
 
 def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     """Draw a row of images for each target view of one scene; no field has a batch dimension.
 
     The nearest input, the target, the rendering with its PSNR, the absolute error, the rendered
-    inverse depth and the true one on the same scale, if known; what a mask excludes is blank.
+    inverse depth and, where the data has depths, the true one on the same scale and the relative
+    error of the rendered depth, not aligned, with AbsRel. What a mask excludes is gray, and so are
+    the last two where the depth is unknown.
     """
     images = {
         "nearest input": nearest_view_images(inputs, targets),
@@ -26,27 +29,37 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     maps = {"error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1)}
     if rendering.depth is not None:
         maps["inverse depth"] = inverse_depths(rendering.depth)
-    if targets.depths is not None:
-        maps["true inverse depth"] = inverse_depths(targets.depths)
+    if (true := known_depths(targets)) is not None:
+        true = true.where(true > 0, torch.nan)
+        maps["true inverse depth"] = 1 / true
+        if rendering.depth is not None:
+            maps[DEPTH_ERROR] = (rendering.depth - true).abs() / true
     if targets.masks is not None:
         maps = {name: values.where(targets.masks, torch.nan) for name, values in maps.items()}
+    maps = {name: values.cpu().float() for name, values in maps.items()}
     titles = (*images, *maps)
     quality = psnr(targets.masked(rendering.image), targets.images)
     aspect = targets.cameras.height / targets.cameras.width
     size = (2 * len(titles), 2 * aspect * targets.num_views + 0.3)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(targets.num_views, len(titles), squeeze=False)
+    shape = targets.num_views, len(titles)
+    axes = figure.subplots(*shape, squeeze=False, subplot_kw={"facecolor": "gray"})
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for view, row in enumerate(axes):
         for axis, image in zip(row, images.values(), strict=False):
             axis.imshow(image[view].clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
-        error, *disparities = (values[view].cpu().float() for values in maps.values())
-        row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
-        for axis, values in zip(row[4:], disparities, strict=True):
-            near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
-            axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
+        disparities = [values[view] for title, values in maps.items() if title not in ERRORS]
+        for axis, (title, values) in zip(row[3:], maps.items(), strict=True):
+            if title in ERRORS:
+                style = {"cmap": "magma", "vmax": ERRORS[title]}
+            else:
+                near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
+                style = {"cmap": "viridis", "vmax": near}
+            axis.imshow(values[view].numpy(), vmin=0, **style)
+        if DEPTH_ERROR in maps:
+            row[-1].set_xlabel(f"AbsRel {maps[DEPTH_ERROR][view].nanmean():.3f}", fontsize=8)
         for axis in row:
             axis.set(xticks=[], yticks=[])
     return figure

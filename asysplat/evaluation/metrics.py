@@ -111,6 +111,13 @@ def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -
     return _mean_where(valid, close.float())
 
 
+def known_depths(views: Views) -> Depths | None:
+    """Return the views' depths, 0 where they are unknown or a mask excludes the pixel."""
+    if views.depths is None or views.masks is None:
+        return views.depths
+    return views.depths.where(views.masks, 0)
+
+
 def _prepare(
     depth: Depths, target: Depths, alignment: Alignment
 ) -> tuple[Depths, Depths, Bool[Tensor, "*batch V H W"]]:
@@ -149,9 +156,19 @@ def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch 
     return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
 
 
+def constant_depths(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt H W"]:
+    """Fill every target with the depth of the mean inverse depth that the inputs know; else 0."""
+    inverse = 1 / known_depths(inputs)
+    mean = inverse.where(inverse.isfinite(), torch.nan).flatten(-3).nanmean(-1)
+    return (1 / mean).nan_to_num()[..., None, None, None].expand_as(targets.depths)
+
+
 BASELINES = {  # name in results: title in tables, and what draws the targets
     "mean_color": ("mean color", mean_color_images),
     "nearest_view": ("nearest view, copied", nearest_view_images),
+}
+DEPTH_BASELINES = {  # likewise, their depths
+    "mean_inverse_depth": ("plane at the mean inverse depth", constant_depths)
 }
 
 

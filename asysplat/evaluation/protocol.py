@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from asysplat.evaluation import metrics
 from asysplat.evaluation.lpips import MIN_SIDE, lpips_distance
-from asysplat.evaluation.metrics import BASELINES, Depths, Images, PerView
+from asysplat.evaluation.metrics import BASELINES, DEPTH_BASELINES, Depths, Images, PerView
 from asysplat.ranges import configured
 from asysplat.scene import Views
 
@@ -79,21 +79,29 @@ class Protocol:
         rendered = rendered.float().clamp(0, 1)
         return targets.masked((rendered * 255).floor() / 255 if self.eight_bit else rendered)
 
-    def depth_metrics(self, depth: Depths, targets: Views) -> dict[str, PerView]:
+    def depth_metrics(
+        self, depth: Depths, targets: Views, median_depth: Depths | None = None
+    ) -> dict[str, PerView]:
         """Compute AbsRel and delta < 1.25 of each view, and AbsRel of depths scaled to the median.
 
-        {} if the data has no depths.
+        Args:
+            depth: `render`'s expected depth.
+            targets: {} is returned if they have no depths.
+            median_depth: `render`'s, whose AbsRel and delta are added; it is wrong where it is 0.
         """
-        if targets.depths is None:
+        target = metrics.known_depths(targets)
+        if target is None:
             return {}
-        target = targets.depths
-        if targets.masks is not None:
-            target = target.where(targets.masks, 0)
-        return {
+        values = {
             "absrel": metrics.abs_rel(depth, target, self.depth_alignment),
             "delta1": metrics.delta1(depth, target, self.depth_alignment),
             "absrel_median": metrics.abs_rel(depth, target, "median"),
         }
+        if median_depth is not None:
+            aligned = median_depth, target, self.depth_alignment
+            values["median_depth_absrel"] = metrics.abs_rel(*aligned)
+            values["median_depth_delta1"] = metrics.delta1(*aligned)
+        return values
 
     def measure_views(
         self,
@@ -102,6 +110,7 @@ class Protocol:
         targets: Views,
         lpips: nn.Module | None,
         psnr_only: bool = False,
+        median_depths: Float[Tensor, "V H W"] | None = None,
     ) -> list[dict[str, float]]:
         """Compute the metrics of each view by itself, as SSIM of many takes much memory."""
         rows = []
@@ -112,18 +121,26 @@ class Protocol:
             else:
                 values = self.image_metrics(image, target, lpips)
                 if depths is not None:
-                    values |= self.depth_metrics(depths[[view]], target)
-            rows.append({name: value.item() for name, value in values.items()})
+                    median = None if median_depths is None else median_depths[[view]]
+                    values |= self.depth_metrics(depths[[view]], target, median)
+            rows += _rows(values)
         return rows
 
     def measure_baselines(
         self, inputs: Views, targets: Views, lpips: nn.Module | None, psnr_only: bool = False
     ) -> dict[str, list[dict[str, float]]]:
-        """Compute the metrics of each of BASELINES, by name; see `measure_views`."""
-        return {
+        """Compute the metrics of each of BASELINES, by name; see `measure_views`.
+
+        And of DEPTH_BASELINES where the data has depths, without `psnr_only`.
+        """
+        baselines = {
             name: self.measure_views(draw(inputs, targets), None, targets, lpips, psnr_only)
             for name, (_, draw) in BASELINES.items()
         }
+        if not psnr_only and inputs.depths is not None and targets.depths is not None:
+            for name, (_, draw) in DEPTH_BASELINES.items():
+                baselines[name] = _rows(self.depth_metrics(draw(inputs, targets), targets))
+        return baselines
 
     def notes(self, lpips: nn.Module | None) -> dict[str, str]:
         """Return what results say of their metrics: protocol/<metric>, or missing/lpips: why."""
@@ -146,6 +163,13 @@ class Protocol:
         median = "depth of each view scaled to the true median"
         aligned = {"none": "depth not aligned", "median": median}[self.depth_alignment]
         pixels = "the pixels of a view that its mask includes and whose depth is known"
+        error = f"mean of |d - t| / t over {pixels}"
+        close = f"share with max(d/t, t/d) < {metrics.DELTA} of {pixels}"
+        expected = "d the expected depth, sum w z / sum w over the Gaussians"
+        half = (
+            "d the median depth, z of the Gaussian that takes the transmittance to half or below, "
+            "0, which counts as wrong, without one"
+        )
         return {
             "name": self.name,
             "psnr": f"{images}, from each image's own MSE (at most 100 dB), {mean}",
@@ -153,7 +177,15 @@ class Protocol:
             f"windows wholly inside the image, mean over channels, {mean}",
             "lpips": f"v0.1 with {BACKBONES[self.lpips_net]}, {images} and scaled to [-1, 1], "
             f"full resolution, {mean}",
-            "absrel": f"mean of |d - t| / t over {pixels}, {aligned}, {mean}",
-            "delta1": f"share with max(d/t, t/d) < 1.25 of {pixels}, {aligned}, {mean}",
-            "absrel_median": f"mean of |d - t| / t over {pixels}, {median}, {mean}",
+            "absrel": f"{error}, {expected}, {aligned}, {mean}",
+            "delta1": f"{close}, {expected}, {aligned}, {mean}",
+            "absrel_median": f"{error}, {expected}, {median}, {mean}",
+            "median_depth_absrel": f"{error}, {half}, {aligned}, {mean}",
+            "median_depth_delta1": f"{close}, {half}, {aligned}, {mean}",
         }
+
+
+def _rows(values: dict[str, PerView]) -> list[dict[str, float]]:
+    """Turn the numbers of V views, by metric, into a row for each view."""
+    views = zip(*(numbers.tolist() for numbers in values.values()), strict=True)
+    return [dict(zip(values, row, strict=True)) for row in views]

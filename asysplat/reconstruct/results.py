@@ -5,12 +5,13 @@ import os
 import tempfile
 import webbrowser
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -30,7 +31,7 @@ from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import PICTURE, SCENE
 from asysplat.runs.summary import (
     RECONSTRUCTION_ROWS,
-    metric_cells,
+    metric_rows,
     print_missing,
     write_json,
 )
@@ -143,15 +144,11 @@ class Results:
             path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 
     def _draw(
-        self,
-        scene: Gaussians | AnchorScene,
-        cameras: Cameras,
-        masks: Bool[Tensor, "V H W"] | None = None,
-        depth: bool = True,
+        self, scene: Gaussians | AnchorScene, cameras: Cameras, depth: bool = True
     ) -> Rendering:
         if isinstance(scene, AnchorScene):
-            return scene.render(cameras, self._background, masks=masks, depth=depth)
-        return render(scene, cameras, self._background, depth=depth, masks=masks, views_at_once=1)
+            return scene.render(cameras, self._background, depth=depth)
+        return render(scene, cameras, self._background, depth=depth, views_at_once=1)
 
     def _save_metrics(self, scene: Gaussians | AnchorScene, progress: RefinementProgress) -> None:
         """Write metrics.json and metrics.csv, and print the table."""
@@ -182,8 +179,13 @@ class Results:
         rows = []
         for view in range(views.num_views):
             target = views.select([view])
-            drawn = self._draw(scene, target.cameras, masks=target.masks)
-            rows += self._protocol.measure_views(drawn.image, drawn.depth, target, self._lpips)
+            seen = scene if isinstance(scene, Gaussians) else scene.decode(target.cameras).gaussians
+            draw = partial(render, seen, target.cameras, self._background, masks=target.masks)
+            drawn = draw()
+            median = None if target.depths is None else draw(depth="median").depth
+            rows += self._protocol.measure_views(
+                drawn.image, drawn.depth, target, self._lpips, median_depths=median
+            )
         return rows
 
     @torch.no_grad()
@@ -229,13 +231,8 @@ def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _print_table(results: dict[str, float | int | str]) -> None:
-    rows = RECONSTRUCTION_ROWS
-    shown = [*rows.values(), "missing"]
+    shown = [*RECONSTRUCTION_ROWS.values(), "missing"]
     metrics = [m for m in METRICS if any(f"{prefix}/{m}" in results for prefix in shown)]
-    cells = [
-        [title, *metric_cells(results, row, metrics)]
-        for title, row in rows.items()
-        if f"{row}/psnr" in results
-    ]
-    print_table(make_console(), ["", *(METRICS[metric] for metric in metrics)], cells)
+    rows = metric_rows(results, RECONSTRUCTION_ROWS, metrics)
+    print_table(make_console(), ["", *(METRICS[metric] for metric in metrics)], rows)
     print_missing(results)

@@ -2,24 +2,25 @@
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from asysplat.evaluation.measured_cost import SECONDS
-from asysplat.evaluation.metrics import BASELINES, METRICS
+from asysplat.evaluation.metrics import BASELINES, DEPTH_BASELINES, METRICS
 from asysplat.files import atomic_write
 from asysplat.terminal import make_console, print_table
 
 TESTED = "tested/"  # group of the options that the scenes of another system were tested with
 Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 
+TITLES = {name: title for name, (title, _) in (BASELINES | DEPTH_BASELINES).items()}
 # Title of a row: prefix of its keys, with a place for the test set.
-BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, (title, _) in BASELINES.items()}
+BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, title in TITLES.items()}
 ROWS = {"trained": "test/{}"} | BASELINE_ROWS
 # The same of a reconstruction, which has one set of photographs
 RECONSTRUCTION_ROWS = {"held out": "held_out", "inputs": "inputs"}
-RECONSTRUCTION_ROWS |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
+RECONSTRUCTION_ROWS |= {title: f"baseline/{name}" for name, title in TITLES.items()}
 
 
 def write_json(path: Path, results: Results) -> None:
@@ -36,6 +37,14 @@ def write_json(path: Path, results: Results) -> None:
 def metric_cells(results: Results, prefix: str, metrics: Iterable[str] = METRICS) -> list[str]:
     """Format results["<prefix>/<metric>"] for a row of a table; empty if not measured."""
     return _cells(results.get(f"{prefix}/{metric}") for metric in metrics)
+
+
+def metric_rows(
+    results: Results, prefixes: Mapping[str, str], metrics: Sequence[str]
+) -> list[list[str]]:
+    """Make a row of a table, title and `metric_cells`, for each title: prefix with a number."""
+    rows = [[title, *metric_cells(results, key, metrics)] for title, key in prefixes.items()]
+    return [row for row in rows if any(row[1:])]
 
 
 def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
@@ -80,19 +89,18 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         metrics = [name for name in METRICS if any(f"{key}/{name}" in results for key in shown)]
         ending = f"/test/{data}/psnr"
         stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
-        methods = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
-        rows = [
-            [label, *metric_cells(results, method.format(data), metrics)]
-            for label, method in methods.items()
-        ]
+        methods = {f"after {stage}": f"{stage}/test/{data}" for stage in stages}
+        methods |= {title: prefix.format(data) for title, prefix in ROWS.items()}
+        rows = metric_rows(results, methods, metrics)
         title = f"test scenes: {data}, metrics: {results['protocol/name']}"
         print_table(console, ["", *(METRICS[name] for name in metrics)], rows, title)
     if other_sets := [name for name in test_sets if name != data]:
+        titles = ("trained", *(title for title, _ in BASELINES.values()))
         rows = [
-            [name, *_cells(results[f"{method.format(name)}/psnr"] for method in ROWS.values())]
+            [name, *_cells(results[f"{ROWS[title].format(name)}/psnr"] for title in titles)]
             for name in other_sets
         ]
-        print_table(console, ["", *ROWS], rows, "other test sets, PSNR (dB)")
+        print_table(console, ["", *titles], rows, "other test sets, PSNR (dB)")
     print_missing(results)
     if costs := describe_costs(results):
         print(costs)
@@ -119,7 +127,8 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
             spent = [results.get(f"{costs}/{method}/{unit}") for unit in ("seconds", "gb")]
             inputs = metric_cells(results, f"inputs/{name}/{method}", ["psnr"])
             cells = metric_cells(results, prefix, metrics)
-            rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
+            if any(cells):
+                rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
         print_table(make_console(), titles, rows, title)
     print_missing(results)
     _print_figures(folder, "evaluation")

@@ -76,7 +76,8 @@ def sweep_table(jobs: Sequence[Job]) -> Table:
     for label, prefix in BASELINE_ROWS.items() if len(names) == 1 else ():
         space = [""] * (len(varied) + 1)
         cells = metric_cells(results_of_runs[-1], prefix.format(names[0]))
-        table.add_row(label, *space, *cells)
+        if any(cells):
+            table.add_row(label, *space, *cells)
     sentences = [text for results in results_of_runs for text in missing_metrics(results)]
     table.caption = "\n".join(dict.fromkeys(sentences))
     return table

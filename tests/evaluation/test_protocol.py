@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from asysplat import Cameras, Views
+from asysplat import Cameras, Gaussians, Views, render
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.protocol import Protocol
 
@@ -131,6 +131,52 @@ def test_a_fully_masked_view_has_no_depth_metric(protocols):
     found = protocols["default"].depth_metrics(torch.ones(2, 8, 8), targets)
     assert found["absrel"][0] == 0 and found["absrel"][1].isnan() and found["delta1"][1].isnan()
     assert protocols["default"].depth_metrics(torch.ones(2, 8, 8), views(targets.images)) == {}
+
+
+@pytest.mark.parametrize(
+    "opacities, weights, median",
+    [((0.4, 0.9), (0.4, 0.54), 4.0), ((0.6, 0.9), (0.6, 0.36), 2.0), ((0.2, 0.2), (0.2, 0.16), 0)],
+)
+def test_the_median_depth_is_that_of_one_of_two_gaussians_or_wrong(
+    protocols, opacities, weights, median
+):
+    gaussians = Gaussians(  # larger than the image, at depths of 2 and 4
+        means=torch.tensor([[0.0, 0, 2], [0, 0, 4]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        scales=torch.tensor([[9.0, 9, 0.01]] * 2),
+        opacities=torch.tensor(opacities),
+        sh=torch.zeros(2, 1, 3),
+    )
+    targets = views(torch.rand(1, 3, 16, 16), torch.full((1, 16, 16), 4.0))
+    depths = [
+        render(gaussians, targets.cameras, backend="reference", depth=kind).depth
+        for kind in ("expected", "median")
+    ]
+    found = protocols["default"].depth_metrics(depths[0], targets, depths[1])
+    expected = (2 * weights[0] + 4 * weights[1]) / sum(weights)
+    assert found["absrel"].item() == pytest.approx(1 - expected / 4, abs=0.01)
+    assert found["median_depth_absrel"].item() == pytest.approx(1 - median / 4)
+    assert found["median_depth_delta1"].item() == (median == 4)
+
+
+def test_the_baseline_of_depths_has_the_mean_known_inverse_depth_of_the_inputs(protocols):
+    protocol, images, masks = protocols["default"], torch.rand(1, 3, 16, 16), torch.ones(1, 16, 16)
+    depths, true = torch.full((1, 16, 16), 1.5), torch.ones(1, 16, 16)
+    depths[:, :, 4:8], depths[:, :, 8:12], depths[:, :, 12:] = 3, 0, 100  # 0: unknown
+    masks[:, :, 12:], true[:, 8:] = 0, 4
+    inputs, targets = views(images, depths, masks.bool()), views(images, true)
+    found = protocol.measure_baselines(inputs, targets, None)
+    assert list(found) == ["mean_color", "nearest_view", "mean_inverse_depth"]
+    # 2 where it is 1 or 4; scaled to the (lower) median it is 1.
+    expected = {"absrel": (1 + 0.5) / 2, "delta1": 0, "absrel_median": 0.75 / 2}
+    assert found["mean_inverse_depth"] == [pytest.approx(expected)]
+    for others in ((inputs, views(images)), (views(images), targets)):
+        assert "mean_inverse_depth" not in protocol.measure_baselines(*others, None)
+    fast = protocol.measure_baselines(inputs, targets, None, psnr_only=True)
+    assert "mean_inverse_depth" not in fast
+    unknown = replace(inputs, depths=torch.zeros_like(depths))
+    (row,) = protocol.measure_baselines(unknown, targets, None)["mean_inverse_depth"]
+    assert (row["absrel"], row["delta1"]) == (1, 0)
 
 
 @pytest.mark.parametrize("name", NAMES)

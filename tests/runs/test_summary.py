@@ -16,6 +16,8 @@ METRICS = {
 }
 STATIC = {"cost/parameters": 2e6, "cost/geometry_ratio": 0.7, "cost/gaussians": 10}
 STEP = {"cost/seconds_per_step": 2.0}
+DEPTHS = {"test/rooms/absrel": 0.25, "baseline/rooms/mean_inverse_depth/absrel": 0.75}
+OTHERS = {key.replace("rooms", "outdoors"): value for key, value in (METRICS | DEPTHS).items()}
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,8 @@ STEP = {"cost/seconds_per_step": 2.0}
     [
         (METRICS | {"missing/lpips": "x=y"}, ["LPIPS", "\nLPIPS: x=y.\n"], ["SSIM"]),
         (METRICS | STATIC | STEP, ["longlrm", "21.500", "2.00M", "2.00 s a step"], ["LPIPS"]),
+        (METRICS | DEPTHS, ["AbsRel", "plane at the mean inverse depth", "0.750"], ["LPIPS"]),
+        (METRICS | OTHERS, ["other test sets", "outdoors", "nearest"], ["AbsRel", "plane"]),
         (STATIC | STEP, ["2.00M", "2.00 s a step"], ["test scenes", "PSNR"]),
         ({}, [], ["parameters", "PSNR"]),
     ],
