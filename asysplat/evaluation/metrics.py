@@ -168,7 +168,7 @@ BASELINES = {  # name in results: title in tables, and what draws the targets
     "nearest_view": ("nearest view, copied", nearest_view_images),
 }
 DEPTH_BASELINES = {  # likewise, their depths
-    "mean_inverse_depth": ("plane at the mean inverse depth", constant_depths)
+    "mean_inverse_depth": ("mean inverse depth", constant_depths)
 }
 
 

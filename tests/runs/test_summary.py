@@ -25,7 +25,7 @@ OTHERS = {key.replace("rooms", "outdoors"): value for key, value in (METRICS | D
     [
         (METRICS | {"missing/lpips": "x=y"}, ["LPIPS", "\nLPIPS: x=y.\n"], ["SSIM"]),
         (METRICS | STATIC | STEP, ["longlrm", "21.500", "2.00M", "2.00 s a step"], ["LPIPS"]),
-        (METRICS | DEPTHS, ["AbsRel", "plane at the mean inverse depth", "0.750"], ["LPIPS"]),
+        (METRICS | DEPTHS, ["AbsRel", "mean inverse depth", "0.750"], ["LPIPS"]),
         (METRICS | OTHERS, ["other test sets", "outdoors", "nearest"], ["AbsRel", "plane"]),
         (STATIC | STEP, ["2.00M", "2.00 s a step"], ["test scenes", "PSNR"]),
         ({}, [], ["parameters", "PSNR"]),
