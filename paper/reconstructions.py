@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import BASELINES, METRICS
 from asysplat.export.gaussians import WRITERS
+from asysplat.export.mesh import MESHES
 from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, make_folder, read_json
 from asysplat.root import typed
@@ -24,7 +25,8 @@ from paper.html import TEMPLATES
 from paper.terminal import print_grid
 
 INDEX = "reconstructions.html"
-FILES = (f"scene{PAGE}", "path.mp4", *(f"scene{suffix}" for suffix in WRITERS if suffix != PAGE))
+SUFFIXES = (*(suffix for suffix in WRITERS if suffix != PAGE), *MESHES)
+FILES = (f"scene{PAGE}", "path.mp4", *(f"scene{suffix}" for suffix in SUFFIXES))
 PSNRS = {"held out": "held_out"}
 PSNRS |= {name.replace("_", " "): f"baseline/{name}" for name in BASELINES}
 # Options that are shown elsewhere, or change no number.

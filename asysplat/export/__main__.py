@@ -15,7 +15,8 @@ if __name__ == "__main__":  # now, since torch takes seconds
     parser.add_argument(
         "output",
         type=Path,
-        help="the new file: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors or .html",
+        help="the new file: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors, .html; "
+        "or a mesh of the surfaces: mesh.ply, mesh.glb, or what ends in .mesh.ply or .mesh.glb",
     )
     parser.add_argument(
         "--keep", type=float, default=1.0, metavar="F", help="keep this fraction, by importance"
@@ -29,6 +30,7 @@ from dataclasses import replace
 
 from asysplat.errors import InputError
 from asysplat.export.gaussians import (
+    CAMERAS,
     READERS,
     WRITERS,
     cameras_beside,
@@ -39,6 +41,7 @@ from asysplat.export.gaussians import (
     write_gaussians,
 )
 from asysplat.export.importance import most_important, picture_psnr
+from asysplat.export.mesh import MESHES, check_mesh_packages, mesh_suffix, write_mesh
 from asysplat.export.page import PAGE, write_page
 from asysplat.interrupts import handle_signals
 
@@ -47,12 +50,15 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     """Write a scene to another file, and print what it took: bytes, Gaussians and likeness.
 
     Args:
-        scene: a file of Gaussians; the cameras beside it, transforms.json, tell what is important.
+        scene: a file of Gaussians; the cameras beside it, transforms.json, tell what is important,
+            and a mesh needs them.
         output: the new file.
         keep: fraction of the Gaussians, by importance, in (0, 1].
         sh_degree: highest degree of SH; None: the scene's.
     """
-    suffix_of(output, WRITERS, "written")
+    suffix = mesh_suffix(output) or suffix_of(output, [*WRITERS, *MESHES], "written")
+    if suffix in MESHES:
+        check_mesh_packages(str(output))
     if not 0 < keep <= 1:
         raise InputError(f"--keep is {keep:g}: give a fraction above 0, at most 1.")
     if output.exists():
@@ -66,14 +72,24 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
         written = most_important(written, keep, cameras)
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
-    if cameras is not None and output.suffix.lower() == PAGE:
+    content = f"{written.num_gaussians:,} Gaussians"
+    if suffix in MESHES:
+        if cameras is None:
+            raise InputError(
+                f"{scene} has no {CAMERAS} of its cameras beside it, which {output.name} needs: "
+                "give the scene.ply of a reconstruction."
+            )
+        content = (
+            f"{len(write_mesh(output, written, cameras, notes.antialiased).faces):,} triangles"
+        )
+    elif cameras is not None and suffix == PAGE:
         write_page(output, written, cameras, names_beside(scene), **notes.look)
     else:
         write_gaussians(output, written, notes)
-    print(f"{output}: {written.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.2f} MB")
+    print(f"{output}: {content}, {output.stat().st_size / 1e6:.2f} MB")
     if any(notes.offset) and read_notes(output).offset != notes.offset:
         print(f"{output.suffix} has no place for the offset {' '.join(map(repr, notes.offset))}")
-    if cameras is not None and output.suffix.lower() in READERS:
+    if cameras is not None and output.suffix.lower() in READERS and suffix not in MESHES:
         likeness = picture_psnr(gaussians, read_gaussians(output), cameras, notes)
         print(f"{likeness:.1f} dB against the pictures of {scene}")
 

@@ -23,6 +23,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS, average, write_csv
 from asysplat.export import write_gaussians, write_page, write_video
 from asysplat.export.gaussians import CAMERAS, NO_NOTES, WRITERS, Notes
+from asysplat.export.mesh import MESHES, check_mesh_packages, write_mesh
 from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, object_center, video_cameras
@@ -57,7 +58,8 @@ class Results:
         )
         always = [] if per_view else [Path(SCENE).suffix]
         self._suffixes = [*read_outputs(config.output), *always]
-        self._suffixes.sort(key=lambda suffix: suffix == PAGE)  # the scene's files first
+        # The scene's files first.
+        self._suffixes.sort(key=lambda suffix: (suffix in MESHES, suffix == PAGE))
         if config.open and PAGE not in self._suffixes:
             raise InputError("open=true opens the page, which output= leaves out: add html to it.")
         check_video(config.video)
@@ -89,14 +91,16 @@ class Results:
         photographs, background = self._photographs, self._background.tolist()
         notes = Notes(photographs.origin, background)
         world = photographs.normalization.to_world(gaussians)
+        cameras = photographs.inputs.cameras.to("cpu")
+        cameras = photographs.normalization.cameras_to_world(cameras)
         for suffix in self._suffixes:
             path = self.folder / f"scene{suffix}"
+            if suffix in MESHES:
+                write_mesh(path, world, cameras)
+                continue
             if suffix != PAGE:
                 save_gaussians(path, world, notes)
                 continue
-            cameras = photographs.normalization.cameras_to_world(
-                photographs.inputs.cameras.to("cpu")
-            )
             names = [Path(file).name for file in photographs.input_files]
             title, center = Path(self._config.path).name, object_center(world, photographs.inputs)
             focus = None if center is None else center.tolist()
@@ -131,6 +135,9 @@ class Results:
         for file in [file for file in files if file.suffix != PAGE][:1]:
             print(f"viewer: asysplat view {file}")
             print(f"scene: {file}")
+        for suffix in MESHES:
+            if suffix in self._suffixes:
+                print(f"mesh: {self.folder / f'scene{suffix}'}")
         for page in (file for file in files if file.suffix == PAGE):
             print(f"page: {page}")
             if self._config.open:
@@ -205,8 +212,10 @@ def read_outputs(output: str | Sequence[str]) -> list[str]:
     """Return the suffixes of the files of a scene that `output` names."""
     names = [output] if isinstance(output, str) else output
     for name in names:
-        if f".{name}" not in WRITERS:
-            known = ", ".join(suffix[1:] for suffix in WRITERS)
+        if f".{name}" in MESHES:
+            check_mesh_packages(f"output={name}")
+        elif f".{name}" not in WRITERS:
+            known = ", ".join(suffix[1:] for suffix in (*WRITERS, *MESHES))
             raise InputError(f"output has {name!r}: choose from {known}.")
     return [f".{name}" for name in names if f".{name}" != Path(SCENE).suffix]
 

@@ -48,8 +48,8 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
     scene = half_turn(prepare_for_export(gaussians), 2)
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=-1).float().roll(-1, 1)
     diffuse = (0.5 + SH_C0 * scene.sh[:, 0]).clamp(0, 1)
-    linear = torch.where(diffuse <= 0.04045, diffuse / 12.92, ((diffuse + 0.055) / 1.055) ** 2.4)
-    colors = (255 * torch.cat((linear, scene.opacities[:, None]), 1)).round().byte()
+    colors = torch.cat((to_linear(diffuse), scene.opacities[:, None]), 1)
+    colors = (255 * colors).round().byte()
     attributes = {"POSITION": scene.means, "COLOR_0": colors, ROTATION: quats, SCALE: scene.scales}
     attributes[OPACITY] = scene.opacities[:, None]
     attributes |= dict(zip(_sh_names(scene.sh.shape[1]), scene.sh.unbind(1), strict=True))
@@ -82,6 +82,11 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
         file.write(CHUNK.pack(size, BINARY))
         for array in arrays:
             file.write(np.ascontiguousarray(array).data)
+
+
+def to_linear(colors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Convert sRGB in [0, 1] to linear light, as glTF's colors of vertices are."""
+    return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
 def _sh_names(count: int) -> list[str]:
