@@ -12,7 +12,7 @@ TINY = ["width=0.125", "state_size=8", "model.layers=1m1s"]
 @pytest.mark.medium
 def test_overrides_change_the_network_that_ships():
     plain, other = load(), load("shipped", ["model.blocks.s.grid=1", "model.prior.planes=24"])
-    assert (plain.prior.planes, other.prior.planes) == (48, 24)
+    assert (plain.prior.planes, other.prior.planes) == (64, 24)
     weights = other.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in plain.state_dict().items())
 

@@ -102,7 +102,7 @@ def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, mo
         assert name == "auto"
         return DEVICE
 
-    options = ("steps=3", "refinement.max_gaussians=300", "views=10", "height=24")
+    options = ("steps=3", "refinement.max_gaussians=1000", "views=10", "height=24")
     options += ("video.path=orbit", f"init={init}")
     finished(command(photographs, *options))
     expected = numbers_of(tmp_path / "run")
@@ -111,7 +111,8 @@ def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, mo
         finished(command(photographs, *options))
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
     numbers = numbers_of(tmp_path / "run")
-    # In float32 a kernel and torch's operators part after some steps of Adam.
+    # In float32 a kernel and torch's operators part after some steps of Adam, and where cells merge
+    # by a last bit: with fewer Gaussians one of them would count.
     for name, tolerance in (
         ("inputs/psnr", 0.01),
         ("held_out/psnr", 0.01),

@@ -75,7 +75,7 @@ def adam(device: torch.device, backend: str) -> dict[str, float]:
 
 
 def plane_sweep(device: torch.device, backend: str) -> dict[str, float]:
-    """Compare the costs, their contrasts and the counts of views."""
+    """Compare the costs, their contrasts, the counts of views and sums around pixels."""
     from asysplat.ops.plane_sweep import reference
 
     draw = seeded_normal(device, torch.float32)
@@ -91,7 +91,8 @@ def plane_sweep(device: torch.device, backend: str) -> dict[str, float]:
         best = module.sgm(costs, trust, edges)
         steps = torch.full((1, 3), 0.02, device=device)
         counts = module.consistency(inverse, steps, trust, neighbors, motions)
-        results.append(KernelResults([costs, best.contrast, *counts]))
+        sums = module.spread(costs[..., :9], edges)
+        results.append(KernelResults([costs, best.contrast, *counts, sums]))
     return relative_errors(*results)
 
 

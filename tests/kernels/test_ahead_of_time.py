@@ -30,7 +30,7 @@ SCANS = ("pass_states", "forward_chunk")
 KERNELS = {
     "rendering": {"project", "list_tiles", "rasterize", "rasterize_backward", "sum_pairs"}
     | {"project_backward"},
-    "plane_sweep": {"cost_band", "add_paths", "count_views"},
+    "plane_sweep": {"cost_band", "add_paths", "count_views", "spread_lines"},
     "selective_scan": {"sum_chunk", "backward_chunk", *SCANS},
     "ssd": {"sum_decays", "score_chunk", "head_gradients", "score_gradients"}
     | {"projection_gradients", *SCANS},

@@ -115,6 +115,20 @@ def test_consistency_equals_the_reference(backend, size):
         assert all(counts.any() for counts in exact)
 
 
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("backend", FAST)
+def test_spread_equals_the_reference(backend, size):
+    height, width, scenes, views = size[:4]
+    form = import_module(f"asysplat.ops.plane_sweep.{backend}")
+    values = torch.rand(scenes, views, height, width, 9)
+    keep = torch.rand(scenes, views, 2, height, width)
+    exact = reference.spread(values.double(), keep.double())
+    given = values.to(DEVICES[backend])
+    got = form.spread(given, keep.to(DEVICES[backend]))
+    assert got.dtype == torch.float32 and torch.equal(given.cpu(), values)
+    torch.testing.assert_close(got.cpu().double(), exact, rtol=1e-5, atol=0)
+
+
 @pytest.mark.skipif(INTERPRETED, reason="slow")
 def test_plane_sweep_equals_the_reference():
     cameras = four_cameras()

@@ -7,7 +7,8 @@ import torch.nn.functional as F
 from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, turned
 
 from asysplat.models.prior import Prior
-from asysplat.models.prior.plane_sweep import edges, plane_sweep, shrink
+from asysplat.models.prior.fill import color_edges
+from asysplat.models.prior.plane_sweep import plane_sweep, shrink
 from asysplat.models.prior.prior import (
     FREE_OPACITY,
     DepthEstimate,
@@ -133,10 +134,10 @@ def test_smaller_images_are_means_over_areas_and_edges_are_color_changes():
         torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))
     images = torch.zeros(1, 1, 3, 4, 5)
     images[..., 2:] = torch.tensor([0.3, 0.6, 0.9])[:, None, None]
-    left, above = edges(images)[0, 0]
+    left, above = color_edges(images)[0, 0]
     torch.testing.assert_close(left[:, 2], torch.full((4,), 0.6))
     assert left.count_nonzero() == 4 and not above.any()
-    torch.testing.assert_close(edges(images.mT)[0, 0, 1], left.T)
+    torch.testing.assert_close(color_edges(images.mT)[0, 0, 1], left.T)
 
 
 def test_projections_for_images_of_any_size():

@@ -2,8 +2,9 @@
 
 The cameras decide the neighbors and the range of depths (`projections.py`). The kernels of
 `asysplat.ops.plane_sweep` compute the matching costs, aggregate them and check the views' depths
-against each other, which gives the confidence. A first sweep at half the resolution narrows the
-range of the second: surfaces fill a tenth of the range that the cameras allow.
+against each other, which gives the confidence; where it is low, planes of what is sure around go on
+(`fill.py`). A first sweep at half the resolution narrows the range of the second: surfaces fill a
+tenth of the range that the cameras allow.
 """
 
 from functools import reduce
@@ -15,7 +16,8 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
-from asysplat.models.prior.prior import DepthEstimate, Prior, count_votes, fill_unknown, other_views
+from asysplat.models.prior.fill import color_edges, fill_unknown
+from asysplat.models.prior.prior import DepthEstimate, Prior, count_votes, other_views
 from asysplat.models.prior.projections import (
     PairwiseProjections,
     choose_neighbors,
@@ -26,10 +28,10 @@ from asysplat.models.prior.projections import (
 from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
 from asysplat.scene import Cameras, Views
 
-PLANES = 48
+PLANES = 64
 NEIGHBORS = 4
 LONGEST_SIDE = 128  # greatest side of the swept images in pixels: more than twice the planes
-FULL_CONTRAST = 0.5  # contrast of a sure depth: mean minus least cost, summed over four paths
+FULL_CONTRAST = 1.0  # contrast of a sure depth: mean minus least cost, summed over four paths
 MIN_AGREEMENT = 0.5  # agreement above which a depth counts for the second sweep's range
 CONTRADICTION = 2.0  # one contradicting view takes two thirds of the confidence
 LUMA = (0.299, 0.587, 0.114)
@@ -137,13 +139,13 @@ def _plane_sweep(
         gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
         into = projections.matrices(chosen, height, width)
         costs = kernels.cost_volume(gray, chosen, into, ranges, planes)
-        borders = edges(images)
+        edges = color_edges(images)
         first, last = ranges[..., None, None, :].unbind(-1)
         spacing = (last - first) / (planes - 1)
         steps = torch.maximum(spacing[..., 0, 0], shortest)
         agreement = valid
         for _ in range(aggregations):
-            best = kernels.sgm(costs, agreement, borders)
+            best = kernels.sgm(costs, agreement, edges)
             inverse = first + best.plane * spacing
             consistency = kernels.consistency(inverse, steps, valid, chosen, into)
             agree, contradict = consistency.agreeing, consistency.contradicting
@@ -167,7 +169,7 @@ def _plane_sweep(
     agreement = agreement / (1 + CONTRADICTION * consistency.contradicting)
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
     precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
-    inverse = fill_unknown(inverse, agreement * precision)
+    inverse = fill_unknown(inverse, agreement * precision, color_edges(images), backend)
     confidence = agreement * (1 + precision) / 2
     return inverse, confidence, *count_votes(inverse, confidence, others, into, backend)
 
@@ -209,10 +211,3 @@ def shrink(
         return images
     rows = reduce(torch.add, (images[..., k::down, :] for k in range(down)))
     return reduce(torch.add, (rows[..., k::right] for k in range(right))) / (down * right)
-
-
-def edges(images: Float[Tensor, "B V 3 H W"]) -> Float[Tensor, "B V 2 H W"]:
-    """Return the mean absolute color difference to the left pixel, and to the pixel above."""
-    left = F.pad(images.diff(dim=-1).abs().mean(2), (1, 0))
-    above = F.pad(images.diff(dim=-2).abs().mean(2), (0, 0, 1, 0))
-    return torch.stack((left, above), dim=2)

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from asysplat.models.prior.fill import color_edges, fill_unknown
 from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import Consistency, load_backend
 from asysplat.scene import TensorRecord, Views
@@ -17,7 +18,6 @@ VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of t
 SURFACE_OPACITY = 0.9  # joint opacity of all views that confirm a surface
 UNCERTAIN_SURFACE_OPACITY = 0.7  # the same of all views that may see a point of uncertain depth
 FREE_OPACITY = 1e-4  # opacity in free space, too small to be drawn
-NEIGHBORHOOD_WEIGHT = 0.05  # against the weight 1 of a pixel's own depth at full confidence
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,9 @@ class Prior(TensorRecord):
         """Compute the prior of known inverse depths, filled where their weight is less than 1."""
         scenes, count, height, width = inverse.shape
         size = (height, width)
-        inverse = fill_unknown(inverse, weight)
+        images = F.interpolate(views.images.flatten(0, 1), size, mode="area")
+        edges = color_edges(images.unflatten(0, (scenes, count))).to(inverse)
+        inverse = fill_unknown(inverse, weight, edges)
         others = other_views(count, scenes, inverse.device)
         projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
         if (surfaces := views.surfaces(size)) is not None:
@@ -127,25 +129,6 @@ def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B
         return torch.full((scenes, 1, 1), -1, device=device)
     following = torch.arange(1, views, device=device) + torch.arange(views, device=device)[:, None]
     return (following % views).expand(scenes, -1, -1)
-
-
-def fill_unknown(
-    inverse: Float[Tensor, "B V h w"], trust: Float[Tensor, "B V h w"]
-) -> Float[Tensor, "B V h w"]:
-    """Replace uncertain inverse depths by those around them; 0 if none is known.
-
-    A pyramid of means, from the whole scene down to each pixel, weighted by the square of `trust`.
-    """
-    weights, sums = [trust**2], [trust**2 * inverse]
-    while max(weights[-1].shape[-2:]) > 1:
-        for maps in (weights, sums):
-            maps.append(F.avg_pool2d(maps[-1], 2, ceil_mode=True))
-    scene = sums[-1].sum(1, keepdim=True) / weights[-1].sum(1, keepdim=True).clamp_min(1e-12)
-    filled = scene.expand_as(weights[-1])
-    for weight, total in zip(reversed(weights), reversed(sums), strict=True):
-        around = F.interpolate(filled, weight.shape[-2:], mode="bilinear")
-        filled = (total + NEIGHBORHOOD_WEIGHT * around) / (weight + NEIGHBORHOOD_WEIGHT)
-    return filled
 
 
 def _per_view_opacity(

@@ -1,8 +1,9 @@
-"""The operators of the plane sweep; each backend is a module with all three.
+"""The operators of the plane sweep; each backend is a module with all four.
 
 `cost_volume` compares the patch around each pixel with neighboring views at every plane (Collins
 1996), `sgm` aggregates the costs along the image's rows and columns (semi-global matching,
-Hirschmueller 2008), and `consistency` counts the other views that confirm or contradict each depth.
+Hirschmueller 2008), `consistency` counts the other views that confirm or contradict each depth, and
+`spread` sums what is known around each pixel.
 `asysplat.models.prior.plane_sweep` computes depths from their results.
 """
 

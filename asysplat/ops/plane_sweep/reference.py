@@ -12,7 +12,7 @@ WINDOW = 5  # pixels along a side of the compared patches
 BEST = 2  # number of neighbors that count at each plane: others may not see the point
 UNMATCHED = 0.8  # greatest cost, for unrelated patches and for points that no neighbor sees
 SECOND = 0.15  # greatest excess of the second best neighbor's cost, as it may not see the point
-NOISE = 3e-4  # variance of noise, added to each patch's: without texture, patches do not correlate
+NOISE = 3e-6  # variance of noise, added to each patch's: about twice that of rounding to 8 bits
 SMALL_STEP = 0.1  # SGM's penalty for one plane more or less than the pixel before
 LARGE_STEP = 1.0  # SGM's penalty for more than one plane, where the color does not change
 EDGE = 0.05  # color difference to the pixel before that halves LARGE_STEP
@@ -21,6 +21,7 @@ MIN_BEND = 1e-9  # smallest curvature of a parabola whose minimum is computed
 TOLERANCE = 0.01  # relative difference up to which two inverse depths agree
 PIXELS_AT_ONCE = 2**20  # pixels whose consistency is checked at a time
 FRONT = 1e-6  # smallest depth in another view that is in front of it, over the depth in this view
+SPREAD_ROUNDS = 2  # rows, then columns: a path turns three times at most
 VECTOR = 16  # planes that the CPU kernel computes at once: its LANES, whose import needs Numba
 
 
@@ -185,6 +186,32 @@ def _aggregate(
         step = torch.minimum(torch.minimum(nearer, farther) + SMALL_STEP, least + step[..., None])
         paths.append(cost + torch.minimum(before, step) - least)
     return torch.stack(paths, dim=dim)
+
+
+def spread(
+    values: Float[Tensor, "B V h w C"], keep: Float[Tensor, "B V 2 h w"]
+) -> Float[Tensor, "B V h w C"]:
+    """Sum the values around each pixel, along rows, then along columns, SPREAD_ROUNDS times.
+
+    A value counts as much as the product of `keep`, in [0, 1], along its path: the factors from the
+    pixel on the left, and from the pixel above.
+    """
+    for _ in range(SPREAD_ROUNDS):
+        for factors, dim in zip(keep[..., None].unbind(2), (3, 2), strict=True):
+            values = _spread_along(values, factors, dim)
+    return values
+
+
+def _spread_along(
+    values: Float[Tensor, "B V h w C"], factors: Float[Tensor, "B V h w 1"], dim: int
+) -> Float[Tensor, "B V h w C"]:
+    pixels, factors = values.unbind(dim), factors.unbind(dim)
+    before, behind = [torch.zeros_like(pixels[0])], [torch.zeros_like(pixels[0])]
+    for pixel, factor in zip(pixels[:-1], factors[1:], strict=True):
+        before.append((before[-1] + pixel) * factor)
+    for pixel, factor in zip(pixels[:0:-1], factors[:0:-1], strict=True):
+        behind.append((behind[-1] + pixel) * factor)
+    return values + torch.stack(before, dim) + torch.stack(behind[::-1], dim)
 
 
 def consistency(
