@@ -120,7 +120,9 @@ def _plane_sweep(planes: int) -> None:
     ranges = torch.ones(1, views, 2)
     costs = plane_sweep.cost_volume(images, neighbors, motions, ranges, planes)
     maps = torch.ones(1, views, 256, 256)
-    plane_sweep.sgm(costs, maps, torch.zeros(1, views, 2, *maps.shape[-2:]))
+    edges = torch.zeros(1, views, 2, *maps.shape[-2:])
+    plane_sweep.sgm(costs, maps, edges)
+    plane_sweep.spread(costs[..., :9], edges)
     plane_sweep.consistency(maps, torch.ones(1, views), maps, neighbors, motions)
 
 
@@ -137,7 +139,7 @@ CASES: dict[str, Callable[[], None]] = {
     TRAINING: lambda: _render(0, 4, False),
     "render, refinement": lambda: _render(1, 1, False, depth=False),
     "render, all options": lambda: _render(*(3, 4, True, True), depth="median", antialiased=True),
-    "plane sweep": lambda: _plane_sweep(48),
+    "plane sweep": lambda: _plane_sweep(64),
     "selective scan, fp32": lambda: _scan(selective_scan, (512,), 16, torch.float32),
     "selective scan, bf16": lambda: _scan(selective_scan, (512,), 16, torch.bfloat16, True),
     "ssd, laptop, fp32": lambda: _scan(ssd, (7, 64), 64, torch.float32),
