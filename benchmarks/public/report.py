@@ -257,6 +257,8 @@ def scenes_of(results: Result) -> list[tuple[str, str]]:
 def plot(results: Result) -> Figure:
     """Plot PSNR over seconds: curves of what ran on this machine, published rows as points."""
     scenes, protocols = scenes_of(results), read_protocols()
+    own = dict.fromkeys(row["method"] for row in results["rows"] if row["mark"])
+    colors = dict(zip(own, CURVES, strict=False))
     columns = min(PANELS, len(scenes))
     lines = math.ceil(len(scenes) / columns)
     with matplotlib.rc_context(STYLE):
@@ -264,10 +266,12 @@ def plot(results: Result) -> Figure:
         grid = figure.subplots(lines, columns, squeeze=False).flat
         names = {}
         for axes, (protocol, scene) in zip(grid, scenes, strict=False):
-            names[axes] = _plot_rows(axes, merged_rows(results["rows"], protocol, scene))
+            names[axes] = _plot_rows(axes, merged_rows(results["rows"], protocol, scene), colors)
             axes.set_title(f"{protocols[protocol].title}: {scene}")
         for axes, those in names.items():
             draw_names(axes, those, 7)
+        for name, color in colors.items():  # the first panel may lack some
+            figure.axes[0].plot([], [], "-o", ms=4, color=color, label=name)
         figure.axes[0].legend(frameon=False, fontsize=9)
         seconds = "seconds: dots on this machine's CPU, crosses and lines as published, on GPUs"
         figure.supxlabel(seconds, color=FAINT)
@@ -277,16 +281,16 @@ def plot(results: Result) -> Figure:
     return figure
 
 
-def _plot_rows(axes: Axes, rows: Sequence[Result]) -> list[Name]:
+def _plot_rows(axes: Axes, rows: Sequence[Result], colors: Mapping[str, str]) -> list[Name]:
     """Plot the rows of a scene; return the names of published ones, still to be drawn."""
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.margins(0.08)
     own = [row for row in rows if row["mark"]]
-    for name, color in zip(dict.fromkeys(row["method"] for row in own), CURVES, strict=False):
+    for name in dict.fromkeys(row["method"] for row in own):
         points = [(row["seconds"], row["psnr"]) for row in own if row["method"] == name]
-        axes.plot(*zip(*sorted(points), strict=True), "-o", ms=4, color=color, label=name)
+        axes.plot(*zip(*sorted(points), strict=True), "-o", ms=4, color=colors[name])
     measured = [row["seconds"] for row in own]
     first, last = min(measured), max(measured)
     names: list[Name] = []
