@@ -85,7 +85,7 @@ def test_what_is_not_seen_or_masked_out_has_no_surface():
     depths, images, cameras = sphere(np.eye(3)[None])
     depths = depths.where(depths.isfinite(), 0)
     mesh = fuse(depths, images, cameras, voxel=0.05)
-    horizon = -1 / DISTANCE  # of z, on the side of the camera
+    horizon = -1 / DISTANCE  # greatest z that the camera sees
     assert mesh.vertices[:, 2].min() < -0.95 and mesh.vertices[:, 2].max() < horizon + 0.05
     masked = depths.clone()
     masked[..., 32:] = 0
@@ -141,7 +141,7 @@ def test_a_file_has_the_opaque_surfaces_and_their_colors(wall, tmp_path, suffix)
     mesh = write_mesh(tmp_path / f"scene{suffix}", *wall)
     x, y, z = mesh.vertices.unbind(-1)
     assert -1.2 < x.min() < -0.9 and -0.1 < x.max() < 0.2
-    inner = (x > -0.8) & (x < -0.2) & (y.abs() < 0.8)  # of the rim, whose back is not seen
+    inner = (x > -0.8) & (x < -0.2) & (y.abs() < 0.8)  # without the rim, whose back is not seen
     assert inner.sum() > 100 and (z - 0.1 * x)[inner].abs().max() < 0.05
     assert (mesh.colors - ORANGE)[inner].abs().max() < 0.02
     vertices, colors = mesh.vertices, mesh.colors

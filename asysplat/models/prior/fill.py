@@ -14,8 +14,7 @@ from asysplat.ops.plane_sweep import load_backend
 
 RADIUS = 16.0  # pixels over which a known depth's weight falls to 1 / e
 COLOR_CHANGE = 0.025  # color difference between adjacent pixels that lowers it as much
-FITS = 2  # in the second, depths far from the first count less
-OUTLIER = 0.1  # relative difference from the first that halves a weight
+OUTLIER = 0.1  # relative difference from a first fit that halves a weight in the second
 SLANT = 1e-3  # variance of positions, in image sides, that is added: a spot fits any slant
 BOUND = 2.0  # greatest ratio of a continued inverse depth to the mean of those around
 SCENE_WEIGHT = 1e-6  # of the scene's mean, where nothing around is known
@@ -40,10 +39,9 @@ def fill_unknown(
     total = weights.sum((1, 2, 3), keepdim=True)
     scene = (weights * inverse).sum((1, 2, 3), keepdim=True) / total.clamp_min(1e-12)
     keep = torch.exp(-1 / RADIUS - edges / COLOR_CHANGE)
-    fitted, known = fit_planes(inverse, weights, keep, backend)
-    for _ in range(1, FITS):
-        error = inverse / fitted.clamp_min(1e-30) - 1
-        fitted, known = fit_planes(inverse, weights / (1 + (error / OUTLIER) ** 2), keep, backend)
+    fitted, _ = fit_planes(inverse, weights, keep, backend)
+    error = inverse / fitted.clamp_min(1e-30) - 1
+    fitted, known = fit_planes(inverse, weights / (1 + (error / OUTLIER) ** 2), keep, backend)
     fitted = (known * fitted + SCENE_WEIGHT * scene) / (known + SCENE_WEIGHT)
     return (weights * inverse + SURROUNDINGS_WEIGHT * fitted) / (weights + SURROUNDINGS_WEIGHT)
 
@@ -62,8 +60,8 @@ def fit_planes(
     x, y = ((torch.arange(side).to(inverse) + 0.5) / max(height, width) for side in (width, height))
     x, y = (x - x.mean()).expand(height, width), (y - y.mean())[:, None].expand(height, width)
     basis = torch.stack((torch.ones_like(x), x, y, x * x, x * y, y * y), dim=-1)
-    known = weights[..., None]
-    moments = torch.cat((known * basis, (known * inverse[..., None]) * basis[..., :3]), dim=-1)
+    weights, inverse = weights[..., None], inverse[..., None]
+    moments = torch.cat((weights * basis, weights * inverse * basis[..., :3]), dim=-1)
     moments = load_backend(backend, inverse).spread(moments, keep)
     known = moments[..., 0]
     _, mx, my, xx, xy, yy, mean, xd, yd = (moments / known.clamp_min(1e-30)[..., None]).unbind(-1)

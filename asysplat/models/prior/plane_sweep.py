@@ -127,6 +127,7 @@ def _plane_sweep(
 
     def sweep(
         images: Float[Tensor, "B V 3 H W"],
+        edges: Float[Tensor, "B V 2 H W"],
         valid: Float[Tensor, "B V H W"],
         ranges: Float[Tensor, "B V 2"],
         aggregations: int,
@@ -139,7 +140,6 @@ def _plane_sweep(
         gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
         into = projections.matrices(chosen, height, width)
         costs = kernels.cost_volume(gray, chosen, into, ranges, planes)
-        edges = color_edges(images)
         first, last = ranges[..., None, None, :].unbind(-1)
         spacing = (last - first) / (planes - 1)
         steps = torch.maximum(spacing[..., 0, 0], shortest)
@@ -154,7 +154,8 @@ def _plane_sweep(
 
     valid = torch.ones_like(images[:, :, 0]) if masks is None else masks.to(images)
     half = [max(1, side // 2) for side in images.shape[-2:]]
-    smaller = shrink(images, *half), (shrink(valid, *half) == 1).to(valid)
+    small = shrink(images, *half)
+    smaller = small, color_edges(small), (shrink(valid, *half) == 1).to(valid)
     inverse, steps, agreement = sweep(*smaller, ranges, aggregations=1)
     # Narrow the ranges to the depths that neighbors agree on, unless these are few.
     observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
@@ -162,14 +163,15 @@ def _plane_sweep(
     greatest = torch.maximum(observed[..., 1] + steps / 2, least + planes * shortest)
     narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
     ranges = torch.where(observed[..., 1:] > 0, narrowed, ranges)
-    inverse, steps, agreement = sweep(images, valid, ranges, aggregations=2)
+    edges = color_edges(images)
+    inverse, steps, agreement = sweep(images, edges, valid, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
     into = projections.matrices(others, *images.shape[-2:])
     consistency = kernels.consistency(inverse, steps, agreement, others, into)
     agreement = agreement / (1 + CONTRADICTION * consistency.contradicting)
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
     precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
-    inverse = fill_unknown(inverse, agreement * precision, color_edges(images), backend)
+    inverse = fill_unknown(inverse, agreement * precision, edges, backend)
     confidence = agreement * (1 + precision) / 2
     return inverse, confidence, *count_votes(inverse, confidence, others, into, backend)
 

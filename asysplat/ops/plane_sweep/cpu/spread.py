@@ -1,6 +1,7 @@
 """Sums along rows and columns on CPUs: a task takes a view, all numbers of a pixel at a time."""
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -13,10 +14,9 @@ def spread(
     values: Float[Tensor, "B V h w C"], keep: Float[Tensor, "B V 2 h w"]
 ) -> Float[Tensor, "B V h w C"]:
     """Compute the sums in float32, of at most LANES numbers a pixel; see `reference.spread`."""
-    sums = values.clone().contiguous()
-    rounds = reference.SPREAD_ROUNDS
+    sums = values.clone(memory_format=torch.contiguous_format)
     arrays = sums.flatten(0, 1).numpy(), keep.flatten(0, 1).contiguous().numpy()
-    run_blocks(spread_views, even_bounds(len(arrays[0])), *arrays, rounds)
+    run_blocks(spread_views, even_bounds(len(arrays[0])), *arrays, reference.SPREAD_ROUNDS)
     return sums
 
 

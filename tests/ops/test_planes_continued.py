@@ -1,12 +1,7 @@
 """Depths where nothing can be matched: walls of one color, the sky, and what nothing surrounds."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "ops"))
 from surfaces import cameras_at, depth_of_plane, four_cameras, texture
 
 from asysplat.models.prior.fill import BOUND, color_edges, fill_unknown
