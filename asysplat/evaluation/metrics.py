@@ -33,13 +33,20 @@ Covariance = Literal["biased", "sample"]
 Alignment = Literal["none", "median"]
 Images = Float[Tensor, "*batch V 3 H W"]
 Depths = Float[Tensor, "*batch V H W"]
+Masks = Bool[Tensor, "*batch V H W"]
 PerView = Float[Tensor, "*batch V"]
 
 
-def psnr(rendered: Images, target: Images) -> PerView:
-    """Compute the PSNR in dB of each image in [0, 1]; `rendered` is clamped."""
-    difference = rendered.float().clamp(0, 1) - target.float()
-    mse = difference.square().mean((-3, -2, -1))
+def psnr(rendered: Images, target: Images, masks: Masks | None = None) -> PerView:
+    """Compute the PSNR in dB of each image in [0, 1], or of the pixels in masks.
+
+    `rendered` is clamped.
+    """
+    square = (rendered.float().clamp(0, 1) - target.float()).square().mean(-3)
+    if masks is None:
+        mse = square.mean((-2, -1))
+    else:
+        mse = (square * masks).sum((-2, -1)) / masks.sum((-2, -1))
     return -10 * mse.clamp_min(MSE_FLOOR).log10()
 
 

@@ -20,8 +20,8 @@ BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 class Protocol:
     """Computes metrics with fixed options; numbers of different protocols cannot be compared.
 
-    Pixels that a view's mask excludes are copied from the target image in every image metric and
-    left out of every depth metric.
+    Pixels that a view's mask excludes are copied from the target image in every image metric, or
+    left out of PSNR, and left out of every depth metric.
 
     Args:
         name: printed with the numbers.
@@ -30,6 +30,7 @@ class Protocol:
         lpips_net: LPIPS' backbone, "alex" or "vgg".
         mean_over: "images": all images alike, or "scenes": first the mean of each scene's images.
         depth_alignment: see `metrics.abs_rel`; for data without metric depth "median".
+        psnr_over: "images": all pixels, or "masks": those in the masks of the views.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Protocol:
     lpips_net: Literal["alex", "vgg"]
     mean_over: Literal["images", "scenes"]
     depth_alignment: metrics.Alignment
+    psnr_over: Literal["images", "masks"] = "images"
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError if images of this size cannot be measured; warn if LPIPS cannot be."""
@@ -52,7 +54,8 @@ class Protocol:
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """Compute the PSNR of each image in dB."""
-        return metrics.psnr(self._prepare(rendered, targets), targets.images)
+        masks = targets.masks if self.psnr_over == "masks" else None
+        return metrics.psnr(self._prepare(rendered, targets), targets.images, masks)
 
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: nn.Module | None
@@ -60,7 +63,7 @@ class Protocol:
         """Compute PSNR, SSIM and, with the network of `load_lpips`, LPIPS of each image."""
         prepared, target = self._prepare(rendered, targets), targets.images
         values = {
-            "psnr": metrics.psnr(prepared, target),
+            "psnr": self.psnr(rendered, targets),
             "ssim": metrics.ssim(prepared, target, self.ssim_window, self.ssim_covariance),
         }
         if lpips is not None and min(target.shape[-2:]) >= MIN_SIDE:
@@ -158,6 +161,7 @@ class Protocol:
             window = f"{window} sigma {metrics.SSIM_SIGMA}".replace("gaussian", "Gaussian")
         cut = " and cut to 8 bits" if self.eight_bit else ""
         images = f"RGB in [0, 1], rendering clamped{cut}"
+        inside = " over the pixels of its mask" if self.psnr_over == "masks" else ""
         by_scene = self.mean_over == "scenes"
         mean = "mean over a scene's images, then over scenes" if by_scene else "mean over images"
         median = "depth of each view scaled to the true median"
@@ -172,7 +176,7 @@ class Protocol:
         )
         return {
             "name": self.name,
-            "psnr": f"{images}, from each image's own MSE (at most 100 dB), {mean}",
+            "psnr": f"{images}, from each image's own MSE{inside} (at most 100 dB), {mean}",
             "ssim": f"{images}, {window}, data range 1, {self.ssim_covariance} covariance, "
             f"windows wholly inside the image, mean over channels, {mean}",
             "lpips": f"v0.1 with {BACKBONES[self.lpips_net]}, {images} and scaled to [-1, 1], "

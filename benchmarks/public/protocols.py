@@ -1,7 +1,7 @@
 """Read the protocols of conf/public, find their scenes, and open them as they say."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,12 +15,13 @@ from asysplat.data.images import same_proportions
 from asysplat.data.photographs import Photographs, load_photographs
 from asysplat.data.readers import LAYOUTS, open_scene
 from asysplat.data.resized import as_published
-from asysplat.data.sequence import SceneOptions
+from asysplat.data.sequence import PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.evaluation.protocol import Protocol
 from asysplat.files import check_exists
 from asysplat.ranges import AtLeastTwo, Count, configured
 from asysplat.root import CONF
+from asysplat.scene import Views
 
 PIXEL = 1  # a side at which no pixels are read
 
@@ -34,9 +35,12 @@ class SceneProtocol:
         views: number of input views, evenly over all that are not held out; "all": all of them.
         position: the whole number of a view's position among them: the "nearest", even if two are
             equally near, or the next one "below".
-        indices: the input views themselves, in place of even ones.
+        indices: these images in place of even ones; the first `views` of them are the input views.
         held_out_every: every so many images are held out, from the first on: of those that the
-            data set names, else of all, in the order of their names.
+            data set names, else of all but `indices`, in the order of their names.
+        excluded: images that are in neither part.
+        masked: held-out images are measured on white, where their masks have the object; input
+            images keep what is behind it.
         metrics: a file of conf/metrics.
     """
 
@@ -49,17 +53,24 @@ class SceneProtocol:
     position: Literal["nearest", "below"] = "nearest"
     indices: tuple[int, ...] | None = None
     held_out_every: Count = 8
+    excluded: tuple[int, ...] = ()
+    masked: bool = False
     background: Background = "mean"
 
     def inputs(self, rest: list[int]) -> list[int]:
         """Select the input views from the indices of the images that are not held out."""
         if self.indices is not None:
-            return list(self.indices)
+            return list(self.indices[: self.views])
         if self.views == "all":
             return rest
         positions = np.linspace(0, len(rest) - 1, self.views)
         whole = positions.round() if self.position == "nearest" else positions
         return [rest[int(position)] for position in whole]
+
+    def held_out(self, named: list[int]) -> list[int]:
+        """Select the held-out images from those that the data set names, or from all."""
+        never = {*self.excluded, *(self.indices or ())}
+        return [index for index in named[:: self.held_out_every] if index not in never]
 
     def read_metrics(self) -> Protocol:
         """Build the metrics."""
@@ -129,10 +140,32 @@ def open_published(
             f"{protocol.title} is measured at {height}x{width}: get the scene at that size."
         )
     images = copies or ("as they are" if lens.height == height else "resized here, Lanczos")
-    named = scene.held_out or list(range(count))
-    held_out = named[:: protocol.held_out_every]
+    held_out = protocol.held_out(scene.held_out or list(range(count)))
     rest = sorted(set(range(count)) - {*scene.held_out, *held_out})
+    inputs = protocol.inputs(rest)
+    if protocol.masked:
+        scene = _with_masks_of(scene, held_out)
     photographs = load_photographs(
-        scene, protocol.inputs(rest), held_out, height, width, protocol.background, say=say
+        scene, inputs, held_out, height, width, protocol.background, say=say
     )
+    if protocol.masked and photographs.held_out is not None:
+        photographs = replace(photographs, held_out=_on_white(photographs.held_out))
     return photographs, images
+
+
+def _with_masks_of(scene: PosedScene, held_out: list[int]) -> PosedScene:
+    """Keep the masks of held-out images alone, as what is measured; raise InputError without."""
+    images = [replace(image, mask=None, is_object=False) for image in scene.images]
+    for index in held_out:
+        if (mask := scene.images[index].mask) is None:
+            raise InputError(
+                f"{scene.images[index].file} has no mask, and it is measured where its mask has "
+                "the object: get the masks of the scene, too."
+            )
+        images[index] = replace(images[index], mask=mask)
+    return replace(scene, images=images)
+
+
+def _on_white(views: Views) -> Views:
+    white = views.images.new_ones(())
+    return replace(views, images=views.images.where(views.masks[:, None], white))

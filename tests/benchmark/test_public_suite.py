@@ -1,9 +1,13 @@
 """The suite of published scenes: splits by hand, whole and right-sized scenes, kept results."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 from rich.console import Console
 
 from asysplat.data import ProceduralScene
@@ -39,6 +43,10 @@ def test_splits_by_hand():
     lego = list(range(100))
     assert PROTOCOLS["blender_8_views"].inputs(lego) == [2, 16, 26, 55, 73, 76, 86, 93]
     assert PROTOCOLS["blender"].inputs(lego) == lego
+    dtu = PROTOCOLS["dtu_6_views"]
+    assert dtu.inputs([]) == [25, 22, 28, 40, 44, 48]
+    left = [1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47]
+    assert dtu.held_out(list(range(49))) == PROTOCOLS["dtu_3_views"].held_out([*range(49)]) == left
     for protocol in PROTOCOLS.values():
         assert protocol.read_metrics().describe()["name"] == protocol.metrics
 
@@ -55,6 +63,34 @@ def test_a_scene_must_be_whole_and_of_the_size(fern):
     }.items():
         with pytest.raises(InputError, match=message):
             open_published(replace(SMALL, scenes={"fern": changed}), fern, lambda _: None)
+
+
+def test_an_object_is_measured_alone(fern, tmp_path):
+    """The inputs keep what is behind it; a gray image of held-out ones is measured by hand."""
+    scene = shutil.copytree(fern, tmp_path / "fern")
+    masked = replace(SMALL, masked=True, metrics="dtu", views=3, indices=(1, 2, 3))
+    with pytest.raises(InputError, match=r"00000\.png has no mask"):
+        open_published(masked, scene, lambda _: None)
+    (scene / "masks").mkdir()
+    inside = np.zeros((24, 32), np.uint8)
+    inside[6:18, 8:24] = 255
+    for image in (scene / "images").iterdir():
+        Image.fromarray(inside).save(scene / "masks" / image.name)
+    photographs, _ = open_published(masked, scene, lambda _: None)
+    full, _ = open_published(replace(SMALL, views=3, indices=(1, 2, 3)), fern, lambda _: None)
+    assert photographs.inputs.images.equal(full.inputs.images)
+    targets, where = photographs.held_out, torch.as_tensor(inside > 0)
+    assert targets.images[:, :, ~where].eq(1).all()
+    assert targets.images[:, :, where].equal(full.held_out.images[:, :, where])
+    gray = torch.full_like(targets.images, 0.5)
+    error = (full.held_out.images[:, :, where] - 0.5).square().mean((1, 2))
+    metrics = masked.read_metrics()
+    torch.testing.assert_close(metrics.psnr(gray, targets), -10 * error.log10())
+    values = metrics.image_metrics(gray, targets, None)
+    white = torch.where(where, gray, 1.0)
+    expected = PROTOCOLS["llff_3_views"].read_metrics().image_metrics(white, targets, None)
+    assert values["ssim"].equal(expected["ssim"])
+    assert "over the pixels of its mask" in metrics.describe()["psnr"]
 
 
 def test_our_rows_stand_between_published_ones_and_are_kept(

@@ -217,6 +217,7 @@ def test_every_option_of_a_protocol_changes_a_description(protocols):
     changes = [
         *({"eight_bit": True}, {"ssim_window": "uniform"}, {"ssim_covariance": "sample"}),
         *({"lpips_net": "vgg"}, {"mean_over": "scenes"}, {"depth_alignment": "median"}),
+        {"psnr_over": "masks"},
     ]
     assert {key for change in changes for key in change} == set(vars(plain)) - {"name"}
     texts = [replace(plain, **change).describe() for change in [{}, *changes]]
