@@ -285,7 +285,7 @@ def make_refiner(
         def refined(inputs: Views) -> Gaussians | AnchorScene:
             known = None if points is None else points.to(inputs.images.device)
             init = "plane_sweep" if known is None else "points"
-            start = initial_gaussians(init, inputs, settings, known)
+            start = initial_gaussians(init, inputs, settings.initial_limit, known)
             of_all = {"background": measure.background, "seed": options.seed, "watch": count}
             return function(start, inputs, settings, **of_all, **limit)
 

@@ -194,7 +194,7 @@ def initialize(
         gaussians = photographs.normalization.to_network(gaussians)
     else:
         gaussians = initial_gaussians(
-            init, photographs.inputs, settings, photographs.points, network
+            init, photographs.inputs, settings.initial_limit, photographs.points, network
         )
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     if network is not None and network.early_exit_fractions:

@@ -192,7 +192,9 @@ class Refined:
 
         def run(scene: Photographs) -> RenderedViews:
             scene = select_inputs(scene, self.views, self.side)
-            gaussians = initial_gaussians(self.init, scene.inputs, settings, scene.points, net)
+            gaussians = initial_gaussians(
+                self.init, scene.inputs, settings.initial_limit, scene.points, net
+            )
             color = scene.inputs.mean_color()
             if self.steps != 0:
                 gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)

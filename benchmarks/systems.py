@@ -163,7 +163,9 @@ def measure_refinement(
     start = curve.start or ("plane_sweep" if photographs.points is None else "points")
     network = load("shipped") if start == "network" else None
     clock = time.perf_counter()
-    gaussians = initial_gaussians(start, photographs.inputs, settings, photographs.points, network)
+    gaussians = initial_gaussians(
+        start, photographs.inputs, settings.initial_limit, photographs.points, network
+    )
     before = time.perf_counter() - clock
     background, rows, due = photographs.background, [], list(marks)
 

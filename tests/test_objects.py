@@ -82,7 +82,7 @@ def test_fog_of_the_backgrounds_color_fades(ball, views):
 
 def test_nothing_is_left_outside_the_hull(views):
     inputs = views.select(range(1, 16))
-    start = initial_gaussians("plane_sweep", inputs, DEFAULT)
+    start = initial_gaussians("plane_sweep", inputs, DEFAULT.initial_limit)
     found = refine(start, inputs, DEFAULT, steps=60, background=WHITE)
     assert found.num_gaussians > 500
     assert (found.means.norm(dim=-1) < 0.6).all() and not is_outside(found.means, inputs).any()
@@ -91,7 +91,7 @@ def test_nothing_is_left_outside_the_hull(views):
     wrong = (on_black.alpha - views.alphas[:1]).abs()
     assert wrong.mean() < 0.03 and on_black.alpha[views.alphas[:1] == 0].mean() < 0.01
     fog = replace(inputs, alphas=None)
-    start = initial_gaussians("plane_sweep", fog, DEFAULT)
+    start = initial_gaussians("plane_sweep", fog, DEFAULT.initial_limit)
     fog = refine(start, fog, DEFAULT, steps=60, background=WHITE)
     assert not (fog.means.norm(dim=-1) < 0.6).all()
 

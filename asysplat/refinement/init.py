@@ -1,4 +1,7 @@
-"""The Gaussians that a refinement starts from, merged where several views show one surface."""
+"""What a refinement starts from: Gaussians, and depths that it keeps.
+
+Gaussians are merged where several views show one surface.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -13,15 +16,15 @@ from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
 from asysplat.refinement.hull import within_hull
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
-from asysplat.refinement.scaffold_gs import ScaffoldSettings
-from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import INRIA
 from asysplat.scene import Cameras, Gaussians, Views
 
 INITS = ("network", "plane_sweep", "points", "depth")
-DEPTH_VIEWS = 64  # most views whose depths are used: with more, cells must be larger to hold fewer
+DEPTH_VIEWS = 64  # most views whose depths are used, evenly selected
 PRIOR_MAX_SIDE = 64  # pixels of a prior's depth maps
 NETWORK_MAX_SIDE = 128  # pixels of the network's input images
+MIN_CONFIDENCE = 0.5  # of a depth that is kept
+MAX_ERROR = 0.5  # of log depths; beyond it the sweep may be wrong, and nothing is pulled
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
 POINT_OPACITY = 0.1
 
@@ -30,20 +33,18 @@ POINT_OPACITY = 0.1
 def initial_gaussians(
     init: str,
     inputs: Views,
-    settings: RefinementSettings | ScaffoldSettings,
+    limit: int,
     points: Float[Tensor, "P 3"] | None = None,
     network: Network | None = None,
 ) -> Gaussians:
-    """Build the Gaussians that a refinement with `settings` starts from, in the frame of `inputs`.
+    """Build the Gaussians that a refinement starts from, `limit` at most, in the frame of `inputs`.
 
-    Of many views, those of DEPTH_VIEWS, evenly selected. Gaussians of several views on the same
-    surface are merged, in cells of a pixel of the network's input or of the prior's depth map, or
-    larger ones: `settings.initial_limit`.
+    Of many views, those of DEPTH_VIEWS: more would be merged in larger cells. Gaussians of several
+    views on the same surface are merged, in cells of a pixel of the network's input or of the
+    prior's depth map, or larger ones.
     """
     pixels = 1.0
-    views = inputs.select(
-        evenly_spaced(range(inputs.num_views), min(DEPTH_VIEWS, inputs.num_views))
-    )
+    views = inputs.select(_depth_views(inputs))
     longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
         if points is None:
@@ -73,7 +74,39 @@ def initial_gaussians(
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
     if inputs.alphas is not None:
         gaussians = within_hull(gaussians, inputs)
-    return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), settings.initial_limit)
+    return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), limit)
+
+
+class KnownDepths:
+    """The plane sweep's depths of DEPTH_VIEWS at most, where other views confirm them.
+
+    Steps would give them up: without texture, photographs are drawn from wrong depths, too.
+    """
+
+    @torch.no_grad()
+    def __init__(self, views: Views):
+        chosen = _depth_views(views)
+        some = views.select(chosen).map(lambda tensor: tensor[None])
+        sweep = PlaneSweepPrior().sweep(some)
+        self._maps = torch.stack((sweep.inverse_depth[0], sweep.confidence[0]), dim=1)
+        self._rows = {view: row for row, view in enumerate(chosen)}
+
+    def error(self, depth: Float[Tensor, "1 H W"], view: int) -> Tensor:
+        """Compute the mean error of a view's log depths by confidence, 0 where it is below .5.
+
+        An error is at most MAX_ERROR, and 0 where no Gaussian is, at depth 0.
+        """
+        if view not in self._rows:
+            return depth.new_zeros(())
+        maps = self._maps[self._rows[view], None].to(depth)
+        inverse, confidence = F.interpolate(maps, depth.shape[-2:], mode="bilinear")[0, :, None]
+        known = (confidence > MIN_CONFIDENCE) & (inverse > 0) & (depth > 0)
+        error = (depth * inverse).where(known, 1).log().abs().clamp_max(MAX_ERROR)
+        return (error * confidence).mean()
+
+
+def _depth_views(views: Views) -> list[int]:
+    return evenly_spaced(range(views.num_views), min(DEPTH_VIEWS, views.num_views))
 
 
 def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
@@ -30,6 +31,7 @@ from asysplat.refinement.fields import (
     correct_poses,
 )
 from asysplat.refinement.hull import within_hull
+from asysplat.refinement.init import KnownDepths
 from asysplat.refinement.isotropic import footprints, random_order
 from asysplat.refinement.settings import DEFAULT, RefinementSettings
 from asysplat.rendering import render
@@ -98,6 +100,10 @@ class Refinement:
         self._steps = self._rounds = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
+
+    @cached_property
+    def _known_depths(self) -> KnownDepths:
+        return KnownDepths(self.views)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -190,13 +196,17 @@ class Refinement:
         if correction:
             cameras = correct_poses(cameras, correction["poses"][view, None])
         gaussians = self.fields.gaussians(leaves)
-        image = render(gaussians, cameras, background, depth=False, masks=target.masks).image
+        with_depth = self.settings.depth > 0 and factor == 1
+        rendering = render(gaussians, cameras, background, depth=with_depth, masks=target.masks)
+        image = rendering.image
         if correction:
             image = correct_exposure(image, correction["exposure"][view, None])
         if self.settings.ssim is None:
             loss = F.mse_loss(target.masked(image), target.images)
         else:
             loss = image_loss(image, target.images, self.settings.ssim, target.masks).sum()
+        if rendering.depth is not None:
+            loss = loss + self.settings.depth * self._known_depths.error(rendering.depth, view)
         if self.settings.densify == "mcmc":
             loss = loss + mcmc_regularizer(gaussians)
         gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])

@@ -57,6 +57,7 @@ class RefinementSettings:
 
     rates: Rates
     ssim: NotNegative | None
+    depth: NotNegative
     few_views: Index
     views_per_step: Count | None
     sh_degree: Annotated[int, Field(ge=0, le=3)] | None

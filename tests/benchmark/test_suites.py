@@ -178,7 +178,7 @@ def test_a_refinement_is_measured_as_it_is_after_its_last_step(tmp_path):
         photographs, curve, [0.05], lambda picture, _: seen.append(picture(cameras)) or {}
     )
     refined = refine(
-        initial_gaussians("plane_sweep", views, curve.settings),
+        initial_gaussians("plane_sweep", views, curve.settings.initial_limit),
         views,
         curve.settings,
         steps=30_000,

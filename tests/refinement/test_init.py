@@ -299,4 +299,4 @@ def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
 )
 def test_a_start_from_what_is_lacking_is_refused(init, message):
     with pytest.raises(InputError, match=message):
-        initial_gaussians(init, front_views(), DEFAULT)
+        initial_gaussians(init, front_views(), DEFAULT.initial_limit)

@@ -30,7 +30,7 @@ def test_a_thousand_steps_have_finite_gradients_and_better_images(shared, scene)
     with poisoned(FILLS[0] if numba.config.BOUNDSCHECK else None):
         folder = str(shared / "data" / scene)
         views = open_photographs(folder, 256, 256, held_out_every=None).inputs
-        start = initial_gaussians("plane_sweep", views, DEFAULT)
+        start = initial_gaussians("plane_sweep", views, DEFAULT.initial_limit)
         end = refine(start, views, steps=1000, watch=watch).validate()
         assert len(non_finite) == 1000 and non_finite[-1] == 0
         runs = [both_ways(FAST[0], end, views.cameras.map(lambda t: t[:2])) for _ in range(2)]

@@ -50,21 +50,27 @@ class PlaneSweepPrior(nn.Module):
         self.planes, self.neighbors, self.longest_side = planes, neighbors, longest_side
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        return Prior.from_estimate(self.sweep(views), views, size)
+
+    def sweep(self, views: Views) -> DepthEstimate:
+        """Estimate the depths of the views, [B, V], shrunk to at most `longest_side` pixels."""
         height, width, factor = views.cameras.height, views.cameras.width, 1
         while max(height, width) > self.longest_side * factor:
             factor *= 2
         small = views.cameras.resized(*(max(1, side // factor) for side in (height, width)))
-        images = shrink(views.images, small.height, small.width)
+        images = views.images
+        if views.masks is not None:  # what is masked out has no effect
+            images = images.where(views.masks[..., None, :, :], 0.5)
+        images = shrink(images, small.height, small.width)
         ranges = None
         if views.point_depths is not None:  # the nearest point in each block of pixels counts
             inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
             inverse = F.max_pool2d(inverse, factor).flatten(2)
             ranges = observed_range(inverse, inverse > 0)
         masks = views.surfaces((small.height, small.width))
-        estimate = plane_sweep(
+        return plane_sweep(
             images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges, masks=masks
         )
-        return Prior.from_estimate(estimate, views, size)
 
 
 def plane_sweep(
