@@ -14,7 +14,8 @@ import torch
 from asysplat.doctor import processor
 from asysplat.errors import InputError
 
-NAMES = ("render", "ops", "model", "data", "formats", "pareto", "systems", "bench", "device")
+NAMES = ("render", "ops", "model", "data", "formats", "pareto", "systems")
+NAMES = (*NAMES, "bench", "device", "launches")
 SUITES = {name: f"benchmarks.{name}" for name in NAMES}
 SUITES |= {name: f"benchmarks.{name}.report" for name in ("public", "stability", "machine_code")}
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}

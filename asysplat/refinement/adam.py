@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -18,7 +19,6 @@ class SelectiveAdam:
 
     Its `parameters`, by name, are contiguous, with a row for each of N Gaussians. A step changes
     them in place; `keep` and `append` replace them. For betas and eps, see `AdamSettings`.
-    `non_finite` counts the visible rows not updated so far, for a NaN or infinite gradient.
     """
 
     def __init__(
@@ -34,9 +34,14 @@ class SelectiveAdam:
                     f"SelectiveAdam got {name} of type {tensor.dtype}: give float32 or float64; "
                     "half precision would lose small steps."
                 )
-        self.non_finite = 0
+        self._non_finite: int | Tensor = 0
         self._settings = AdamSettings(*betas, eps)
         self._state = {name: _zero_state(tensor) for name, tensor in self.parameters.items()}
+
+    @property
+    def non_finite(self) -> int:
+        """Number of visible rows not updated so far, for a NaN or infinite gradient."""
+        return int(self._non_finite)
 
     @property
     def num_rows(self) -> int:
@@ -47,7 +52,7 @@ class SelectiveAdam:
     def step(
         self,
         gradients: Mapping[str, Float[Tensor, "N ..."] | None],
-        rates: Mapping[str, float | Tensor],
+        rates: Mapping[str, float | Float[np.ndarray, "..."]],
         visible: Bool[Tensor, "N"],
     ) -> None:
         """Update the visible rows, except those with a non-finite gradient.
@@ -59,16 +64,16 @@ class SelectiveAdam:
         _expect("visible", visible, (self.num_rows,))
         row_rates = {}
         for name, rate in rates.items():
-            parameter = self.parameters[name]
-            rate = torch.as_tensor(rate, dtype=parameter.dtype)
-            numbers = rate.expand(parameter.shape[1:]).reshape(-1)
+            numbers = np.broadcast_to(rate, self.parameters[name].shape[1:]).ravel()
             if numbers.any():
                 row_rates[name] = numbers
         if not row_rates:
             return
         # One transfer for all, as a GPU waits for each.
         sizes = [len(numbers) for numbers in row_rates.values()]
-        moved = torch.cat([*row_rates.values()]).to(visible.device).split(sizes)
+        dtype = next(iter(self.parameters.values())).dtype
+        together = np.concatenate([*row_rates.values()]).tolist()
+        moved = torch.tensor(together, dtype=dtype, device=visible.device).split(sizes)
         tensors = []
         for name, numbers in zip(row_rates, moved, strict=True):
             parameter, state = self.parameters[name], self._state[name]
@@ -77,7 +82,7 @@ class SelectiveAdam:
             fields = (parameter, gradient, state["mean"], state["square"])
             flat = (tensor.view(self.num_rows, len(numbers)) for tensor in fields)
             tensors.append(Rows(*flat, state["steps"], numbers.to(parameter.dtype)))
-        self.non_finite += adam_step(tensors, visible.contiguous(), self._settings)
+        self._non_finite += adam_step(tensors, visible.contiguous(), self._settings)
 
     @torch.no_grad()
     def keep(self, index: Int[Tensor, "M"]) -> None:

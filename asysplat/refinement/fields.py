@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -65,7 +66,7 @@ class Fields:
         are not updated.
         """
         visible = gradients["logits"] != 0
-        bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
+        bands = np.full((self.count, 1), rates.sh * rates.sh_rest, np.float32)
         bands[0] = rates.sh
         bands[(sh_degree + 1) ** 2 :] = 0
         of_others = 1 if means_alone else factor

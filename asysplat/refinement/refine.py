@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
+from operator import itemgetter
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -136,9 +137,11 @@ class Refinement:
         factor = settings.final_lr_factor**cooled
         error, sums = 0.0, ()
         for view in chosen:
-            target, background = self._before_background(views.select([view]))
+            # A slice copies nothing and waits for no GPU.
+            one = views.map(itemgetter(slice(view, view + 1)))
+            target, background = self._before_background(one)
             mse, of_view = self._gradients(target, background, view, leaves, factor)
-            self._densifier.observe_view(of_view[0], views.cameras.select([view]))
+            self._densifier.observe_view(of_view[0], target.cameras)
             sums = list(map(torch.add, sums, of_view)) if sums else of_view
             error += mse / len(chosen)
         gradients = dict(zip(leaves, sums, strict=True))

@@ -56,9 +56,8 @@ def apply_passes(
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     poses = (cameras.cam_to_world, cameras.intrinsics)
     size = (cameras.height, cameras.width)
-    stats: dict[str, int] = {}
     masks = masks if settings.culling.masks else None
-    *images, origins = passes.apply(settings, size, masks, stats, centers, *fields, *poses)
+    *images, origins, stats = passes.apply(settings, size, masks, centers, *fields, *poses)
     return RenderOutputs(*images, stats, origins)
 
 

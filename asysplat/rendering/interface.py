@@ -1,8 +1,9 @@
 """The arguments and results of a rendering backend."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -112,6 +113,26 @@ class Projections(TensorRecord):
     radii: Float[Tensor, "*batch V N"]
 
 
+class RenderStatistics(Mapping):
+    """Numbers by name, counted when one is first read: until then nobody waits for a GPU."""
+
+    def __init__(self, count: Callable[[], dict[str, int]]):
+        self._count = count
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return self._count()
+
+    def __getitem__(self, name: str) -> int:
+        return self._numbers[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+
 @dataclass(frozen=True)
 class RenderOutputs:
     """Images without background; I counts the views of all scenes.
@@ -126,7 +147,7 @@ class RenderOutputs:
     alpha: Float[Tensor, "I H W"]  # sum of w_i
     transmittance: Float[Tensor, "I H W"]  # 1 - alpha, to float32's relative precision also near 0
     depth: Float[Tensor, "I H W"] | None
-    stats: dict[str, int]
+    stats: dict[str, int] | RenderStatistics
     depth_origin: Float[Tensor, "I H W"] | None = None
 
 

@@ -5,6 +5,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,6 +27,7 @@ from asysplat.rendering.interface import (
     Projections,
     RenderOutputs,
     RenderSettings,
+    RenderStatistics,
 )
 from asysplat.rendering.reference.project import project_centers
 from asysplat.scene import Cameras, Gaussians, TensorRecord
@@ -68,7 +70,7 @@ class Rendering(TensorRecord):
     image: Float[Tensor, "*batch V 3 H W"]
     alpha: Float[Tensor, "*batch V H W"]
     depth: Float[Tensor, "*batch V H W"] | None
-    stats: dict[str, int]
+    stats: dict[str, int] | RenderStatistics
     projections: Projections | None = None
 
 
@@ -254,7 +256,7 @@ def draw_in_chunks(
 
     def draw_views(
         views: slice, inputs: Sequence[Tensor]
-    ) -> tuple[list[Tensor | None], dict[str, int]]:
+    ) -> tuple[list[Tensor | None], dict[str, int] | RenderStatistics]:
         """Draw `views` from their inputs; return images as [B, views, ...], and statistics."""
         *fields, poses, intrinsics = inputs
         chunk_cameras = Cameras(intrinsics, poses, cameras.height, cameras.width)
@@ -269,10 +271,9 @@ def draw_in_chunks(
             if num_views == cameras.num_views:
                 return draw(gaussians, cameras, settings, masks)
             slices = [slice(i, i + num_views) for i in range(0, cameras.num_views, num_views)]
-            stats: dict[str, int] = {}
             fields = [getattr(gaussians, name) for name in NAMES if name not in PER_VIEW]
             poses = (cameras.cam_to_world, cameras.intrinsics)
-            *images, origins = _Deferred.apply(draw_views, slices, stats, *fields, *poses)
+            *images, origins, stats = _Deferred.apply(draw_views, slices, *fields, *poses)
             return RenderOutputs(*images, stats, origins)
         except (torch.OutOfMemoryError, MemoryError) as error:
             if num_views <= 1:
@@ -290,25 +291,22 @@ class _Deferred(torch.autograd.Function):
     """Saves only the inputs; the backward pass draws each chunk again, with a graph."""
 
     @staticmethod
-    def forward(ctx, draw_views, slices, stats, *tensors):
+    def forward(ctx, draw_views, slices, *tensors):
         ctx.draw_views, ctx.slices = draw_views, slices
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        parts = []
-        for views in slices:
-            images, chunk_stats = draw_views(views, _select(tensors, views))
-            parts.append(images)
-            for name, count in chunk_stats.items():
-                stats[name] = count + (0 if name in NOT_SUMMED else stats.get(name, 0))
-        return tuple(
+        drawn = (draw_views(views, _select(tensors, views)) for views in slices)
+        parts, stats = zip(*drawn, strict=True)
+        images = (
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
             for images in zip(*parts, strict=True)
         )
+        return *images, RenderStatistics(partial(_sum_statistics, stats))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        shape, needed = ctx.saved_tensors[-1].shape[:2], ctx.needs_input_grad[3:]
+        shape, needed = ctx.saved_tensors[-1].shape[:2], ctx.needs_input_grad[2:]
         totals = [
             torch.zeros_like(tensor) if need else None
             for tensor, need in zip(ctx.saved_tensors, needed, strict=True)
@@ -320,7 +318,7 @@ class _Deferred(torch.autograd.Function):
                 images, _ = ctx.draw_views(views, inputs)
             outputs = [
                 (image, grad.unflatten(0, shape)[:, views])
-                for image, grad in zip(images, grads, strict=True)
+                for image, grad in zip(images, grads[:-1], strict=True)
                 if grad is not None and image is not None and image.requires_grad
             ]
             drawn, drawn_grads = map(list, zip(*outputs, strict=True))
@@ -328,7 +326,12 @@ class _Deferred(torch.autograd.Function):
             for name, total, tensor in zip(NAMES, totals, inputs, strict=True):
                 if total is not None and tensor.grad is not None:
                     (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)
-        return (None, None, None, *totals)
+        return (None, None, *totals)
+
+
+def _sum_statistics(chunks: Sequence[dict[str, int] | RenderStatistics]) -> dict[str, int]:
+    totals = {name: sum(chunk[name] for chunk in chunks) for name in chunks[0]}
+    return totals | {name: chunks[0][name] for name in NOT_SUMMED if name in totals}
 
 
 def _select(tensors: Sequence[Tensor], views: slice) -> list[Tensor]:

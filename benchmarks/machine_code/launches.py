@@ -48,17 +48,17 @@ def record_launches(capability: int) -> list[Launch]:
     No GPU is needed, and nothing is computed.
     """
     hopper = "asysplat.ops.ssd.cuda._compute_capability"
-    with _recording() as (launches, fills), patch(hopper, lambda x: divmod(capability, 10)):
+    with recording() as (launches, fills), patch(hopper, lambda x: divmod(capability, 10)):
         for case, run in CASES.items():
             start = len(launches)
-            fills[:] = [_keep_one_pair] if case.startswith("render") else []
+            fills[:] = [keep_one_pair] if case.startswith("render") else []
             run()
             launches[start:] = [launch._replace(case=case) for launch in launches[start:]]
     return launches
 
 
 @contextmanager
-def _recording() -> Iterator[tuple[list[Launch], list[Callable]]]:
+def recording() -> Iterator[tuple[list[Launch], list[Callable]]]:
     """Record launches; each also goes to the functions `fills`, which may write results."""
     launches: list[Launch] = []
     fills: list[Callable[[dict[str, Any]], None]] = []
@@ -77,7 +77,7 @@ def _recording() -> Iterator[tuple[list[Launch], list[Callable]]]:
         yield launches, fills
 
 
-def _keep_one_pair(arguments: dict[str, Any]) -> None:
+def keep_one_pair(arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if name in ("depths", "counts"):
             value.fill_(1)

@@ -28,8 +28,8 @@ from benchmarks.machine_code.launches import record_launches
 
 SCANS = ("pass_states", "forward_chunk")
 KERNELS = {
-    "rendering": {"project", "list_tiles", "rasterize", "rasterize_backward", "sum_pairs"}
-    | {"project_backward"},
+    "rendering": {"pack_cameras", "project", "list_tiles", "rasterize", "rasterize_backward"}
+    | {"sum_pairs", "project_backward"},
     "plane_sweep": {"cost_band", "add_paths", "count_views", "spread_lines"},
     "selective_scan": {"sum_chunk", "backward_chunk", *SCANS},
     "ssd": {"sum_decays", "score_chunk", "head_gradients", "score_gradients"}

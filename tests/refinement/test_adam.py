@@ -2,6 +2,7 @@
 
 import inspect
 
+import numpy as np
 import pytest
 import torch
 
@@ -155,7 +156,7 @@ def test_a_tensor_without_a_rate_stays_and_may_start_later(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_elements_of_a_row_may_have_their_own_rates(dtype):
-    whole, rates = SelectiveAdam(normal(dtype=dtype)), torch.full((16, 1), 5e-5)
+    whole, rates = SelectiveAdam(normal(dtype=dtype)), np.full((16, 1), 5e-5)
     rates[0] = 1e-3
     sh = whole.parameters["sh"]
     parts = SelectiveAdam({"first": sh[:, :1].clone(), "rest": sh[:, 1:].clone()})

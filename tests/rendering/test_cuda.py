@@ -8,13 +8,27 @@ import torch
 from compiler import DEVICE, INTERPRETED, kernel
 
 from asysplat.errors import InputError
-from asysplat.rendering import GSPLAT_1_5, cpu, reference
+from asysplat.rendering import GSPLAT_1_5, cpu, formulas, reference
 from asysplat.rendering.interface import RenderSettings, without_culling
 from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
 
 draw_by_cuda = BACKENDS["cuda"]
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+@kernel
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cameras_are_packed_to_the_same_bits(make_scene, dtype):
+    from asysplat.rendering.cuda import draw as module
+
+    _, cameras = make_batch(make_scene, scenes=2, device=DEVICE)
+    poses, intrinsics = cameras.cam_to_world.to(dtype), 1.1 * cameras.intrinsics.to(dtype)
+    size, settings = (cameras.height, cameras.width), RenderSettings()
+    count = poses[..., 0, 0].numel()
+    frame = module.Frame(count, poses.shape[1], 1, 1, *size, columns=1, tiles=1)
+    rows = module._pack_cameras(frame, poses, intrinsics, settings)
+    assert rows.equal(formulas.camera_rows(poses, intrinsics, size, settings.limits))
 
 
 def weighted_sum(image):

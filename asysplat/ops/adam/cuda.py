@@ -10,7 +10,7 @@ from functools import cache
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
@@ -21,7 +21,7 @@ TILE = 65536 if INTERPRETED else 1024  # numbers of a program
 
 def adam_step_cuda(
     tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings
-) -> int:
+) -> Int[Tensor, ""]:
     """Update the visible rows; see `asysplat.ops.adam.adam_step`."""
     alive = visible.to(torch.int8)
     corrections = _corrections_on(settings, visible.device)
@@ -43,7 +43,7 @@ def adam_step_cuda(
                 **sizes,
                 **FUSED,
             )
-    return int(visible.sum() - alive.sum())
+    return visible.sum() - alive.sum()
 
 
 @cache

@@ -1,5 +1,7 @@
 """The image loss by its formula in torch, for any device and float type."""
 
+from functools import cache
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -37,9 +39,14 @@ def _ssim(x: Float[Tensor, "*batch 3 H W"], y: Float[Tensor, "*batch 3 H W"]) ->
     return luminance * (2 * covariance + C2) / (variance_x + variance_y + C2)
 
 
+@cache
+def _window_on(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "11"]:
+    return window_weights().to(device, dtype)
+
+
 def _blur(image: Float[Tensor, "*batch 3 H W"]) -> Float[Tensor, "*batch 3 h w"]:
     # Not a convolution: cuDNN would round its factors to TF32.
-    weights = window_weights().to(image)
+    weights = _window_on(image.device, image.dtype)
     for dim in (-1, -2):
         image = image.unfold(dim, SIZE, 1) @ weights
     return image

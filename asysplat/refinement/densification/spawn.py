@@ -37,7 +37,7 @@ class ErrorDensifier(Densifier):
 
     def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
         self._steps += 1
-        self._last_visible[visible] = self._steps
+        self._last_visible.masked_fill_(visible, self._steps)  # an index would wait for a GPU
 
     @torch.no_grad()
     def densify(self, views: Views, target: int) -> None:

@@ -49,12 +49,13 @@ def draw(
 
 
 class _Passes(torch.autograd.Function):
-    """The forward and backward passes; the forward pass fills `stats`."""
+    """The forward and backward passes; statistics are the last result."""
 
     @staticmethod
-    def forward(ctx, settings, size, masks, stats, centers, *tensors):
+    def forward(ctx, settings, size, masks, centers, *tensors):
         frame = _frame(tensors, size, settings)
         inputs = _inputs(tensors, size, settings)
+        stats: dict[str, int] = {}
         lists = _list_tiles(frame, *_project(frame, inputs), masks, stats)
         images, saved, auxiliary = _rasterize(frame, lists, settings.depth, stats)
         _, _, transmittance, _, origins = images
@@ -64,11 +65,11 @@ class _Passes(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         if origins is not None:
             ctx.mark_non_differentiable(origins)
-        return images
+        return *images, stats
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
+    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, *_):
         *tensors, transmittance = ctx.saved_tensors
         frame, lists = ctx.frame, ctx.lists
         grad_image, grad_transmittance = formulas.image_gradients(
@@ -84,11 +85,11 @@ class _Passes(torch.autograd.Function):
         tiles = weighted_bounds(lists.first_entry)
         run_blocks(raster.rasterize_backward, tiles, lists, frame, saved, grads, *depths)
         inputs = _inputs(tensors, ctx.size, ctx.settings)
-        needs = (ctx.needs_input_grad[9], any(ctx.needs_input_grad[10:]))
+        needs = (ctx.needs_input_grad[8], any(ctx.needs_input_grad[9:]))
         pairs = (lists.first_pair, grads.pairs)
-        centers = _center_gradients(frame, *pairs) if ctx.needs_input_grad[4] else None
+        centers = _center_gradients(frame, *pairs) if ctx.needs_input_grad[3] else None
         fields = _project_backward(frame, inputs, needs, pairs, tensors)
-        return (None,) * 4 + (centers, *fields)
+        return None, None, None, centers, *fields
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Frame:

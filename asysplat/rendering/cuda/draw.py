@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,13 +12,19 @@ from torch.autograd.function import once_differentiable
 from asysplat.errors import InputError
 from asysplat.kernels.triton_utils import INTERPRETED
 from asysplat.rendering import formulas
-from asysplat.rendering.cuda.project import COUNTERS, project
+from asysplat.rendering.cuda.project import COUNTERS, pack_cameras, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
 from asysplat.rendering.cuda.rasterize import SavedForBackward, rasterize, rasterize_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
 from asysplat.rendering.cuda.tiles import TileLists, list_tiles
 from asysplat.rendering.formulas import KernelInputs
-from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs, check_splats
+from asysplat.rendering.interface import (
+    RenderOutputs,
+    RenderSettings,
+    RenderStatistics,
+    check_pairs,
+    check_splats,
+)
 from asysplat.scene import Cameras, Gaussians
 
 BLOCK = 128  # Gaussians of a program
@@ -48,28 +55,30 @@ def draw(
 
 
 class _Passes(torch.autograd.Function):
-    """The forward and backward passes; the forward pass fills `stats`."""
+    """The forward and backward passes; statistics are the last result."""
 
     @staticmethod
-    def forward(ctx, settings, size, masks, stats, centers, *tensors):
+    def forward(ctx, settings, size, masks, centers, *tensors):
         frame = _frame(tensors, size)
-        inputs = _inputs(tensors, size, settings)
-        with torch.cuda.device_of(inputs.means):
+        with torch.cuda.device_of(tensors[0]):
+            rows = _pack_cameras(frame, *tensors[5:], settings)
+            inputs = _inputs(tensors, rows)
             splats, depths, counters = _project(frame, inputs, settings)
             lists, box_tiles = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
             images, saved = _rasterize(frame, lists, settings)
-        _count(stats, lists, saved, counters, box_tiles, settings.culling.ellipse)
-        ctx.save_for_backward(*tensors, *lists, *saved)
-        ctx.settings, ctx.size, ctx.frame = settings, size, frame
+        cull_ellipse = settings.culling.ellipse
+        stats = RenderStatistics(partial(_count, lists, saved, counters, box_tiles, cull_ellipse))
+        ctx.save_for_backward(*tensors, rows, *lists, *saved)
+        ctx.settings, ctx.frame = settings, frame
         ctx.set_materialize_grads(False)
         if saved.origins is not None:
             ctx.mark_non_differentiable(saved.origins)
-        return images
+        return *images, stats
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
-        tensors, rest = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
+    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, *_):
+        tensors, rows, rest = ctx.saved_tensors[:7], ctx.saved_tensors[7], ctx.saved_tensors[8:]
         count = len(TileLists._fields)
         lists, saved = TileLists(*rest[:count]), SavedForBackward(*rest[count:])
         frame, settings = ctx.frame, ctx.settings
@@ -97,21 +106,21 @@ class _Passes(torch.autograd.Function):
                 STEP=BACKWARD_STEP,
                 **RASTER_OPTIONS,
             )
-            inputs = _inputs(tensors, ctx.size, settings)
+            inputs = _inputs(tensors, rows)
             needs = {
-                "SH_NEEDED": ctx.needs_input_grad[9],
-                "CAMERAS_NEEDED": any(ctx.needs_input_grad[10:]),
+                "SH_NEEDED": ctx.needs_input_grad[8],
+                "CAMERAS_NEEDED": any(ctx.needs_input_grad[9:]),
             }
             grads = _project_backward(frame, inputs, lists, pair_grads, settings, needs)
         centers = None
-        if ctx.needs_input_grad[4]:
+        if ctx.needs_input_grad[3]:
             centers = _center_gradients(frame, lists, pair_grads)
         poses = (None, None)
         if grads.cameras is not None:
             poses = formulas.camera_gradients(grads.cameras.sum(1), *tensors[5:])
         fields = zip(grads[:5], tensors[:5], strict=True)
         fields = (None if grad is None else grad.view(field.shape) for grad, field in fields)
-        return (None,) * 4 + (centers, *fields, *poses)
+        return None, None, None, centers, *fields, *poses
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
@@ -132,12 +141,28 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
     )
 
 
-def _inputs(
-    tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
-) -> KernelInputs:
-    *fields, cam_to_world, intrinsics = tensors
-    cameras = formulas.camera_rows(cam_to_world, intrinsics, size, settings.limits)
-    return KernelInputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
+def _pack_cameras(
+    frame: Frame, cam_to_world: Tensor, intrinsics: Tensor, settings: RenderSettings
+) -> Tensor:
+    """Compute the rows of `formulas.camera_rows` in one launch."""
+    shape = (frame.images, formulas.CAMERA)
+    rows = torch.empty(shape, dtype=torch.float64, device=intrinsics.device)
+    pack_cameras[(frame.images,)](
+        cam_to_world=cam_to_world.detach().contiguous(),
+        intrinsics=intrinsics.detach().contiguous(),
+        rows=rows,
+        height=frame.height,
+        width=frame.width,
+        MARGIN=settings.limits.frustum_margin,
+        num_warps=1,
+        **PROJECT_OPTIONS,
+    )
+    return rows
+
+
+def _inputs(tensors: Sequence[Tensor], cameras: Tensor) -> KernelInputs:
+    fields = (field.detach().contiguous().flatten(0, 1) for field in tensors[:5])
+    return KernelInputs(*fields, cameras=cameras)
 
 
 def _kinds(settings: RenderSettings) -> dict[str, bool]:
@@ -183,7 +208,7 @@ def _project(
 def _list_tiles(
     frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, cull_ellipse: bool
 ) -> tuple[TileLists, Tensor]:
-    """Sort the pairs by tile and depth; also count the tiles that the splats' boxes would touch.
+    """Sort the pairs by tile and depth; also count the tiles that boxes of splats would touch.
 
     Depths [images * N] are 0 where there is no splat. With `cull_ellipse`, tiles of a box that the
     ellipse does not touch are left out.
@@ -223,7 +248,7 @@ def _list_tiles(
         pairs=numbers,
         active=None if masks is None else formulas.active_tiles(masks, TILE.value),
     )
-    return lists, box_tiles.sum()
+    return lists, box_tiles
 
 
 def _rasterize(
@@ -264,27 +289,29 @@ def _rasterize(
 
 
 def _count(
-    stats: dict[str, int],
     lists: TileLists,
     saved: SavedForBackward,
     counters: Tensor,
     box_tiles: Tensor,
     cull_ellipse: bool,
-) -> None:
-    """Fill the statistics; the program waits for the GPU once."""
+) -> dict[str, int]:
+    """Count the statistics; the program waits for the GPU once."""
     lengths = lists.first_entry.diff()
     masked = lengths.new_zeros(()) if lists.active is None else (lengths * ~lists.active).sum()
     drawn = (saved.last_entry - lists.first_entry[:-1]).sum()
-    counted = (*counters.sum(0), box_tiles, masked, drawn, lists.counts.count_nonzero())
+    counted = (*counters.sum(0), box_tiles.sum(), masked, drawn, lists.counts.count_nonzero())
     by_opacity, by_frustum, box_tiles, masked, drawn, visible = torch.stack(counted).tolist()
     pairs = len(lists.entries)
-    stats["visible"] = visible
-    stats["culled_by_opacity"], stats["culled_by_frustum"] = by_opacity, by_frustum
-    stats["pairs"] = pairs
-    stats["pairs_culled_by_ellipse"] = box_tiles - pairs if cull_ellipse else 0
-    stats["pairs_culled_by_masks"] = masked
-    stats["pairs_culled_by_opaque"] = pairs - masked - drawn
-    stats["tile_size"] = TILE.value
+    return {
+        "visible": visible,
+        "culled_by_opacity": by_opacity,
+        "culled_by_frustum": by_frustum,
+        "pairs": pairs,
+        "pairs_culled_by_ellipse": box_tiles - pairs if cull_ellipse else 0,
+        "pairs_culled_by_masks": masked,
+        "pairs_culled_by_opaque": pairs - masked - drawn,
+        "tile_size": TILE.value,
+    }
 
 
 def _project_backward(

@@ -8,6 +8,9 @@ from asysplat.rendering.cuda.math import (
     CAMERA,
     CX,
     CY,
+    FX,
+    HIGH_X,
+    LOW_X,
     covariance,
     direction,
     ellipse_rows,
@@ -27,6 +30,29 @@ EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
 WIDENED = tl.constexpr(1 + 3e-6)  # what float32 rounds off of an extent
 COUNTERS = 2  # Gaussians culled by their opacity, and by the frustum
+
+
+@kernel
+def pack_cameras(cam_to_world, intrinsics, rows, height, width, MARGIN: tl.constexpr):
+    """Write the row of one image; see `formulas.camera_rows`."""
+    image = tl.program_id(0).to(tl.int64)
+    row, pinhole, k = rows + CAMERA * image, intrinsics + 9 * image, tl.arange(0, 16)
+    pose = tl.load(cam_to_world + 16 * image + 4 * (k % 3) + k // 3, mask=k < 12, other=0.0)
+    tl.store(row + k, pose.to(tl.float64), mask=k < 12)
+    store_axis(row, pinhole, 0, width, MARGIN)
+    store_axis(row, pinhole, 1, height, MARGIN)
+
+
+@kernel
+def store_axis(row, pinhole, axis: tl.constexpr, pixels, MARGIN: tl.constexpr):
+    """Write the focal length, the principal point and the limits of one image axis."""
+    focal = tl.load(pinhole + 4 * axis).to(tl.float64)
+    principal = tl.load(pinhole + 3 * axis + 2).to(tl.float64)
+    margin = tl.full((), MARGIN, tl.float64) * pixels
+    tl.store(row + FX + axis, focal)
+    tl.store(row + CX + axis, principal)
+    tl.store(row + LOW_X + 2 * axis, (-principal - margin) / focal)
+    tl.store(row + HIGH_X + 2 * axis, (pixels - principal + margin) / focal)
 
 
 @kernel

@@ -1,0 +1,51 @@
+"""How often a rendering and a step of a refinement call a GPU, and wait for it."""
+
+import pytest
+import torch
+from compiler import INTERPRETED
+from rich.console import Console
+
+pytest.importorskip("triton")
+if INTERPRETED:
+    pytest.skip("Triton interprets its kernels here", allow_module_level=True)
+
+from asysplat.rendering import render
+from benchmarks import launches
+
+MOST = {  # launches and waits
+    "render": (18, 2),  # waits for the numbers of splats, and of pairs
+    "render, with a graph": (18, 2),
+    "its gradient": (5, 0),
+    "step of a refinement": (147, 4),  # these two, the learning rates, and the error
+}
+
+
+def test_no_more_launches_and_waits_than_today(make_options):
+    results = launches.measure(make_options("launches", {}), Console(quiet=True))
+    found = {row["case"]: (row["launches"], row["waits"]) for row in results["rows"]}
+    assert found.keys() == MOST.keys()
+    for case, (most, waits) in MOST.items():
+        assert found[case][0] <= most and found[case][1] <= waits, case
+    (table,) = launches.tables(results)
+    assert table.row_count == len(MOST)
+
+
+def test_statistics_wait_when_they_are_read():
+    with launches.as_on_a_gpu() as recorder:
+        views, gaussians = launches.make_views(2), launches.make_gaussians(needed=False)
+        with recorder.counting() as drawn:
+            stats = render(gaussians, views.cameras, depth=False, views_at_once=1).stats
+        with recorder.counting() as read:
+            assert stats["tile_size"] == 8
+            assert {*stats} >= {"visible", "pairs"} and len(stats) == 8
+    assert drawn.waits == 2 * 2 and read.waits == 2
+
+
+def test_what_is_counted():
+    mask = torch.tensor([True, False])
+    with launches.as_on_a_gpu() as recorder, recorder.counting() as counts:
+        values = torch.ones(2)[None].squeeze(0)  # one launch
+        values = values[mask]  # one, which waits
+        values.sum().item()  # two, one waits
+        torch.tensor([1.0])  # a copy, which waits
+    assert (counts.operators, counts.waits, counts.kernels) == (5, 3, 0)
