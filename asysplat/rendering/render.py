@@ -133,7 +133,7 @@ def render(
     """
     if gaussians.means.is_cuda and torch.cuda.is_current_stream_capturing():
         raise InputError(
-            "render waits for the GPU to count its splats, which a CUDA graph cannot hold: call it "
+            "render waits for the GPU to count pairs, which a CUDA graph cannot hold: call it "
             "outside torch.cuda.graph."
         )
     if sh_degree not in (None, 0, 1, 2, 3):

@@ -84,7 +84,7 @@ def measure_work(scene: Scene) -> RenderingWork:
     return RenderingWork(
         programs={
             "project": math.ceil(num / BLOCK),
-            "list_tiles": math.ceil(visible / BLOCK),
+            "list_tiles": math.ceil(visible / BLOCK),  # others end at once
             "rasterize": tiles,
             "rasterize_backward": tiles,
             "sum_pairs": math.ceil(num / SUM_BLOCK),
@@ -100,7 +100,7 @@ def measure_work(scene: Scene) -> RenderingWork:
         },
         bytes={
             "project": NUMBER * num * (fields + SPLAT.value + 1),
-            "list_tiles": NUMBER * visible * (SPLAT.value + 3) + 6 * pairs,
+            "list_tiles": NUMBER * (visible * SPLAT.value + 4 * num) + 6 * pairs,
             "rasterize": NUMBER * (visible * SPLAT.value + pairs + 7 * pixels),
             "rasterize_backward": NUMBER
             * (visible * SPLAT.value + pairs * (3 + GRADIENT.value) + 7 * pixels),

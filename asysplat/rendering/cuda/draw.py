@@ -210,18 +210,19 @@ def _list_tiles(
 ) -> tuple[TileLists, Tensor]:
     """Sort the pairs by tile and depth; also count the tiles that boxes of splats would touch.
 
-    Depths [images * N] are 0 where there is no splat. With `cull_ellipse`, tiles of a box that the
-    ellipse does not touch are left out.
+    Depths [images * N] are infinite where there is no splat. With `cull_ellipse`, tiles of a box
+    that the ellipse does not touch are left out.
     """
     tiles, device = frame.images * frame.tiles, splats.device
-    visible = torch.nonzero(depths)[:, 0]
-    # By depth across all images; the sort by tile separates the images.
-    order = visible[torch.argsort(depths[visible], stable=True)]
+    # By depth across all images; the sort by tile separates the images. What is no splat comes
+    # last: to leave it out, the host would have to wait for the number of splats.
+    order = torch.argsort(depths, stable=True)
     programs = (-(-len(order) // BLOCK),)
-    counts = torch.zeros(len(depths), dtype=torch.int32, device=device)
-    box_tiles = torch.zeros(programs, dtype=torch.int32, device=device)
+    counts = torch.empty(len(depths), dtype=torch.int32, device=device)
+    box_tiles = torch.empty(programs, dtype=torch.int32, device=device)
     first_pair = torch.empty_like(counts)
-    common = {"splats": splats, "order": order, "counts": counts, "num_visible": len(order)}
+    common = {"splats": splats, "depths": depths, "order": order, "counts": counts}
+    common |= {"total": len(order)}
     common |= {"num": frame.num, "CULL_ELLIPSE": cull_ellipse, "BLOCK": BLOCK}
     common |= frame.grid | PROJECT_OPTIONS
     if len(order):

@@ -64,7 +64,7 @@ def project(
     sh,
     cameras,
     splats,  # written, like the next two
-    depths,  # [images * num], 0 where culled
+    depths,  # [images * num], infinite where culled
     counters,  # [programs, COUNTERS]
     num,
     views,
@@ -128,7 +128,7 @@ def project(
         a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
         ellipse = (x, y, a, b, c, extent_y)
         store_splat(splats, d, ellipse, log_opacity, color, z, visible)
-    tl.store(depths + d, tl.where(visible, z, 0.0).to(tl.float32), mask=n < num)
+    tl.store(depths + d, tl.where(visible, z, float("inf")).to(tl.float32), mask=n < num)
     counter = counters + 2 * (image * tl.num_programs(0) + tl.program_id(0))
     tl.store(counter, culled_by_opacity)
     tl.store(counter + 1, culled_by_frustum)

@@ -35,14 +35,15 @@ class TileLists(NamedTuple):
 @kernel
 def list_tiles(
     splats,
-    order,  # [num_visible] splats by depth
+    depths,  # [images * N], infinite where there is no splat
+    order,  # [images * N] splats by depth
     counts,  # [images * N] tiles of each splat
     box_tiles,  # [programs]
-    ends,  # [num_visible] 1 + the index of a splat's last pair
+    ends,  # [images * N] 1 + the index of a splat's last pair, in `order`
     tile_of,  # [pairs] tile of each pair
     owners,  # [pairs] splat of each pair
     first_pair,  # [images * N]
-    num_visible,
+    total,  # images * N
     num,
     height,
     width,
@@ -54,8 +55,9 @@ def list_tiles(
 ):
     """Count the tiles of BLOCK splats, and of their boxes; with WRITE, list these pairs instead."""
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    valid = rank < num_visible
-    d = tl.load(order + rank, mask=valid, other=0)
+    exists = rank < total
+    d = tl.load(order + rank, mask=exists, other=0)
+    valid = tl.load(depths + d, mask=exists, other=float("inf")) < float("inf")
     ellipse = load_ellipse(splats, d, valid)
     first_row, last_row = tile_rows(ellipse, height)
     last_row = tl.where(valid, last_row, first_row - 1)
@@ -78,7 +80,7 @@ def list_tiles(
                 tl.store(owners + pair, d.to(tl.int32), mask=in_span)
         count += right - left + 1
     if not WRITE:
-        tl.store(counts + d, count, mask=valid)
+        tl.store(counts + d, count, mask=exists)
         left, right = box_columns(ellipse, width)
         box = (last_row - first_row + 1) * (right - left + 1)
         tl.store(box_tiles + tl.program_id(0), tl.sum(box, 0))
