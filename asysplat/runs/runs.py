@@ -44,7 +44,7 @@ NOT_HASHED = (
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
     *("trainer.num_sanity_val_steps", "data.micro_batch"),
-    *("training.checkpoint_layers", "training.views_at_once"),
+    *("training.checkpoint_layers", "training.compile", "training.views_at_once"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 

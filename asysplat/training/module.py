@@ -34,6 +34,7 @@ class SplattingModule(lightning.LightningModule):
             the input views, else their mean color; in training, in place of that mean, black or
             white, whichever is less like it, so that transparent Gaussians never lower the loss.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
+        compile: run each layer as `torch.compile` makes it, for each size of images anew.
         views_at_once: targets of each scene that are rendered at a time; None: all. See `render`.
         drop_above: drop a step whose gradient's norm is above this multiple of the trainer's
             gradient_clip_val, as Long-LRM does; None: drop none.
@@ -48,12 +49,16 @@ class SplattingModule(lightning.LightningModule):
         background: Sequence[float] | Literal["inputs"],
         matrix_optimizer: Callable[[list[nn.Parameter]], Optimizer] | None = None,
         checkpoint_layers: bool = False,
+        compile: bool = False,
         views_at_once: int | None = None,
         drop_above: float | None = None,
     ):
         super().__init__()
         freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
+        if compile:
+            for layer in _all_layers(net):
+                layer.compile(dynamic=False)
         self.net, self.loss = net, loss
         self.optimizer, self.matrix_optimizer, self.schedule = optimizer, matrix_optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
@@ -66,8 +71,7 @@ class SplattingModule(lightning.LightningModule):
         """Shard the parameters among the processes, layer by layer, if the strategy is FSDP's."""
         if self.device_mesh is None or isinstance(self.net, FSDPModule):
             return
-        groups = [module for module in self.net.modules() if isinstance(module, Layers)]
-        for block in (*(layer for layers in groups for layer in layers), self.net):
+        for block in (*_all_layers(self.net), self.net):
             fully_shard(block, mesh=self.device_mesh["data_parallel"])
 
     def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
@@ -163,10 +167,14 @@ def decaying(net: nn.Module) -> list[nn.Parameter]:
     return weights if tokens is None else [*weights, tokens]
 
 
+def _all_layers(net: nn.Module) -> list[nn.Module]:
+    groups = (module for module in net.modules() if isinstance(module, Layers))
+    return [layer for layers in groups for layer in layers]
+
+
 def block_matrices(net: nn.Module) -> list[nn.Parameter]:
     """List the trained weight matrices of the blocks, which lie between tokenizer and head."""
-    blocks = [module for module in net.modules() if isinstance(module, Layers)]
-    linear = [m for block in blocks for m in block.modules() if isinstance(m, nn.Linear)]
+    linear = [m for layer in _all_layers(net) for m in layer.modules() if isinstance(m, nn.Linear)]
     return [module.weight for module in linear if module.weight.requires_grad]
 
 
