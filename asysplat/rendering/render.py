@@ -5,7 +5,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -295,13 +294,17 @@ class _Deferred(torch.autograd.Function):
         ctx.draw_views, ctx.slices = draw_views, slices
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        drawn = (draw_views(views, _select(tensors, views)) for views in slices)
-        parts, stats = zip(*drawn, strict=True)
-        images = (
+        parts, stats = [], {}
+        for views in slices:
+            images, chunk_stats = draw_views(views, _select(tensors, views))
+            parts.append(images)
+            for name, count in chunk_stats.items():  # now, as they hold memory of their chunk
+                stats[name] = count + (0 if name in NOT_SUMMED else stats.get(name, 0))
+        whole = (
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
             for images in zip(*parts, strict=True)
         )
-        return *images, RenderStatistics(partial(_sum_statistics, stats))
+        return *whole, stats
 
     @staticmethod
     @once_differentiable
@@ -327,11 +330,6 @@ class _Deferred(torch.autograd.Function):
                 if total is not None and tensor.grad is not None:
                     (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)
         return (None, None, *totals)
-
-
-def _sum_statistics(chunks: Sequence[dict[str, int] | RenderStatistics]) -> dict[str, int]:
-    totals = {name: sum(chunk[name] for chunk in chunks) for name in chunks[0]}
-    return totals | {name: chunks[0][name] for name in NOT_SUMMED if name in totals}
 
 
 def _select(tensors: Sequence[Tensor], views: slice) -> list[Tensor]:

@@ -34,11 +34,11 @@ def test_statistics_wait_when_they_are_read():
     with launches.as_on_a_gpu() as recorder:
         views, gaussians = launches.make_views(2), launches.make_gaussians(needed=False)
         with recorder.counting() as drawn:
-            stats = render(gaussians, views.cameras, depth=False, views_at_once=1).stats
+            stats = render(gaussians, views.cameras, depth=False).stats
         with recorder.counting() as read:
             assert stats["tile_size"] == 8
             assert {*stats} >= {"visible", "pairs"} and len(stats) == 8
-    assert drawn.waits == read.waits == 2  # one a chunk
+    assert drawn.waits == read.waits == 1
 
 
 def test_what_is_counted():

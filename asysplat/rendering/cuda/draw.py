@@ -66,8 +66,9 @@ class _Passes(torch.autograd.Function):
             splats, depths, counters = _project(frame, inputs, settings)
             lists, box_tiles = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
             images, saved = _rasterize(frame, lists, settings)
-        cull_ellipse = settings.culling.ellipse
-        stats = RenderStatistics(partial(_count, lists, saved, counters, box_tiles, cull_ellipse))
+        counted = (lists.first_entry, saved.last_entry, lists.active, lists.counts)
+        counted += (counters, box_tiles if settings.culling.ellipse else None, len(lists.entries))
+        stats = RenderStatistics(partial(_count, *counted))
         ctx.save_for_backward(*tensors, rows, *lists, *saved)
         ctx.settings, ctx.frame = settings, frame
         ctx.set_materialize_grads(False)
@@ -290,27 +291,29 @@ def _rasterize(
 
 
 def _count(
-    lists: TileLists,
-    saved: SavedForBackward,
+    first_entry: Tensor,
+    last_entry: Tensor,
+    active: Tensor | None,
+    counts: Tensor,
     counters: Tensor,
-    box_tiles: Tensor,
-    cull_ellipse: bool,
+    box_tiles: Tensor | None,
+    pairs: int,
 ) -> dict[str, int]:
-    """Count the statistics; the program waits for the GPU once."""
-    lengths = lists.first_entry.diff()
-    masked = lengths.new_zeros(()) if lists.active is None else (lengths * ~lists.active).sum()
-    drawn = (saved.last_entry - lists.first_entry[:-1]).sum()
-    counted = (*counters.sum(0), box_tiles.sum(), masked, drawn, lists.counts.count_nonzero())
-    by_opacity, by_frustum, box_tiles, masked, drawn, visible = torch.stack(counted).tolist()
-    pairs = len(lists.entries)
+    """Count the statistics, from little of what was drawn; the program waits for the GPU once."""
+    lengths, zero = first_entry.diff(), first_entry.new_zeros(())
+    masked = zero if active is None else (lengths * ~active).sum()
+    boxed = zero if box_tiles is None else box_tiles.sum() - pairs
+    drawn = (last_entry - first_entry[:-1]).sum()
+    numbers = torch.stack((*counters.sum(0), boxed, masked, drawn, counts.count_nonzero()))
+    by_opacity, by_frustum, by_ellipse, by_masks, drawn, visible = numbers.tolist()
     return {
         "visible": visible,
         "culled_by_opacity": by_opacity,
         "culled_by_frustum": by_frustum,
         "pairs": pairs,
-        "pairs_culled_by_ellipse": box_tiles - pairs if cull_ellipse else 0,
-        "pairs_culled_by_masks": masked,
-        "pairs_culled_by_opaque": pairs - masked - drawn,
+        "pairs_culled_by_ellipse": by_ellipse,
+        "pairs_culled_by_masks": by_masks,
+        "pairs_culled_by_opaque": pairs - by_masks - drawn,
         "tile_size": TILE.value,
     }
 
