@@ -101,7 +101,7 @@ def run_passes(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
     middle = device_time(backend.device)
     gradients = torch.autograd.grad(out.image, leaves, weights)
     seconds = {"forward": middle - start, "backward": device_time(backend.device) - middle}
-    return Outputs(out.image.detach(), gradients, seconds, out.stats)
+    return Outputs(out.image.detach(), gradients, seconds, dict(out.stats))
 
 
 def run_exact(scene: Scene, ignored: Tensor | None = None) -> Outputs:

@@ -46,7 +46,7 @@ def psnr(rendered: Images, target: Images, masks: Masks | None = None) -> PerVie
     if masks is None:
         mse = square.mean((-2, -1))
     else:
-        mse = (square * masks).sum((-2, -1)) / masks.sum((-2, -1))
+        mse = (square * masks).sum((-2, -1)) / masks.sum((-2, -1)).clamp_min(1)
     return -10 * mse.clamp_min(MSE_FLOOR).log10()
 
 

@@ -17,6 +17,7 @@ MOST = {  # launches and waits
     "render, with a graph": (13, 1),
     "its gradient": (5, 0),
     "step of a refinement": (142, 3),  # for this number, the learning rates, and the error
+    "with known depths": (184, 3),
 }
 
 
