@@ -54,8 +54,7 @@ class Protocol:
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """Compute the PSNR of each image in dB."""
-        masks = targets.masks if self.psnr_over == "masks" else None
-        return metrics.psnr(self._prepare(rendered, targets), targets.images, masks)
+        return self._psnr(self._prepare(rendered, targets), targets)
 
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: nn.Module | None
@@ -63,7 +62,7 @@ class Protocol:
         """Compute PSNR, SSIM and, with the network of `load_lpips`, LPIPS of each image."""
         prepared, target = self._prepare(rendered, targets), targets.images
         values = {
-            "psnr": self.psnr(rendered, targets),
+            "psnr": self._psnr(prepared, targets),
             "ssim": metrics.ssim(prepared, target, self.ssim_window, self.ssim_covariance),
         }
         if lpips is not None and min(target.shape[-2:]) >= MIN_SIDE:
@@ -76,6 +75,10 @@ class Protocol:
             f"not measured, as {BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in "
             "paths.weights; paths.download=true fetches it"
         )
+
+    def _psnr(self, prepared: Images, targets: Views) -> PerView:
+        masks = targets.masks if self.psnr_over == "masks" else None
+        return metrics.psnr(prepared, targets.images, masks)
 
     def _prepare(self, rendered: Images, targets: Views) -> Images:
         """Clamp to [0, 1], truncate to 8 bits if set, and copy the target at excluded pixels."""

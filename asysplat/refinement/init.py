@@ -23,8 +23,8 @@ INITS = ("network", "plane_sweep", "points", "depth")
 DEPTH_VIEWS = 64  # most views whose depths are used, evenly selected
 PRIOR_MAX_SIDE = 64  # pixels of a prior's depth maps
 NETWORK_MAX_SIDE = 128  # pixels of the network's input images
-MIN_CONFIDENCE = 0.5  # of a depth that is kept
-MAX_ERROR = 0.5  # of log depths; beyond it the sweep may be wrong, and nothing is pulled
+MIN_CONFIDENCE = 0.5  # least of a depth that is kept
+MAX_ERROR = 0.5  # difference of log depths beyond which nothing is pulled: the sweep may be wrong
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
 POINT_OPACITY = 0.1
 

@@ -167,5 +167,4 @@ def _with_masks_of(scene: PosedScene, held_out: list[int]) -> PosedScene:
 
 
 def _on_white(views: Views) -> Views:
-    white = views.images.new_ones(())
-    return replace(views, images=views.images.where(views.masks[:, None], white))
+    return replace(views, images=views.images.where(views.masks[:, None], 1.0))

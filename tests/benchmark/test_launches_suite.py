@@ -16,7 +16,7 @@ MOST = {  # launches and waits
     "render": (13, 1),  # waits for the number of pairs
     "render, with a graph": (13, 1),
     "its gradient": (5, 0),
-    "step of a refinement": (142, 3),  # for this number, the learning rates, and the error
+    "step of a refinement": (142, 3),  # waits for it, the learning rates, and the error
     "with known depths": (184, 3),
 }
 

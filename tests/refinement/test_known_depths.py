@@ -35,7 +35,7 @@ def test_the_error_by_hand(scene, monkeypatch):
     torch.testing.assert_close(known.error(depth, 0), expected / 6)
     (slope,) = torch.autograd.grad(known.error(depth, 0), depth)
     assert (slope != 0).tolist() == [[[True, False, False], [False, False, True]]]
-    assert known.error(depth, 1) == 0  # of nine views, the first and the last are swept
+    assert known.error(depth, 1) == 0  # DEPTH_VIEWS is 2: the first and the last view are swept
 
 
 def test_steps_keep_depths_that_are_known(scene):
