@@ -1,9 +1,10 @@
-"""What rendering and refinement ask of a GPU: operators of torch, kernels, and waiting of the host.
+"""What rendering and refinement ask of a GPU: operators of torch, kernels, waiting, and memory.
 
 No GPU is needed: operators run on a CPU, and our kernels are recorded instead of run. A GPU waits
 for the host where each takes microseconds, and the host for it where a number or a length is read.
 """
 
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from importlib.util import find_spec
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
@@ -19,6 +21,8 @@ from rich.table import Table
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.weak import WeakIdKeyDictionary
 
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
@@ -35,15 +39,24 @@ TRACKED = TrackedMetrics(
 NOTES = """\
 operators: of torch, without those that only view or allocate; a sort is one, and several kernels; \
 kernels: ours; waits: where the host reads from the device, or copies numbers to it"""
+MEMORY_NOTES = """\
+MB of tensors besides the Gaussians, without what a sort allocates for itself; each Gaussian \
+touches five tiles; kept: between both passes; peak: with the gradients of image and Gaussians"""
+SCENES = {  # Gaussians, SH degree, height and width
+    "100,000 Gaussians, 540x960": (100_000, 0, 540, 960),
+    "1 million, 1080x1920": (1_000_000, 0, 1080, 1920),
+    "5 million, 1080x1920, SH degree 3": (5_000_000, 3, 1080, 1920),
+}
 # Operators that launch nothing.
 FREE = {"view", "_unsafe_view", "expand", "permute", "transpose", "t", "slice", "select", "unbind"}
 FREE |= {"unsqueeze", "squeeze", "detach", "alias", "as_strided", "split", "split_with_sizes"}
 FREE |= {"diagonal", "unfold", "_reshape_alias", "is_same_size", "unflatten", "promote_types"}
 FREE |= {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided"}
-# Results whose values or sizes the host needs; and a tensor made of the host's numbers, a copy.
-READ = {"lift_fresh", "_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal"}
+# Results whose values or sizes the host needs.
+READ = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal"}
 BY_MASK = {"index", "index_put_", "_index_put_impl_"}  # if an index is boolean
-COPIES = {Tensor.tolist, Tensor.cpu, Tensor.numpy}
+COPIES = {Tensor.tolist, Tensor.cpu, Tensor.numpy, Tensor.new_tensor}
+TO_A_DEVICE = {torch.tensor, torch.as_tensor}  # if it is given
 
 
 @dataclass
@@ -81,7 +94,35 @@ class _Copies(TorchFunctionMode):
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         self.counts.waits += function in COPIES
+        self.counts.waits += function in TO_A_DEVICE and "device" in (kwargs or {})
         return function(*args, **(kwargs or {}))
+
+
+class _Memory(TorchDispatchMode):
+    """Counts the bytes of the storages that operators allocate, until they are freed."""
+
+    def __init__(self):
+        super().__init__()
+        self.now = self.peak = 0
+        self._seen = WeakIdKeyDictionary()  # storages
+
+    def __torch_dispatch__(self, operator, types, args=(), kwargs=None):
+        self._add_new((args, kwargs), counted=False)
+        results = operator(*args, **(kwargs or {}))
+        self._add_new(results, counted=True)
+        return results
+
+    def _add_new(self, values: object, counted: bool) -> None:
+        for tensor in tree_leaves(values):
+            storage = tensor.untyped_storage() if isinstance(tensor, Tensor) else None
+            if storage is not None and storage not in self._seen:
+                size = storage.nbytes() * counted
+                self._seen[storage] = weakref.ref(storage, partial(self._add, -size))
+                self._add(size)
+
+    def _add(self, count: int, _: object = None) -> None:
+        self.now += count
+        self.peak = max(self.peak, self.now)
 
 
 class Recorder(NamedTuple):
@@ -129,23 +170,25 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": for each case the numbers of operators, kernels, both together, and waits.
+        "memory": for each of SCENES the bytes kept between both passes of a rendering, and most.
     """
     if not find_spec("triton"):
         raise InputError("suite=launches needs Triton, which comes with torch on Linux.")
     with as_on_a_gpu() as recorder:
-        return {"rows": [row for case in CASES for row in case(recorder)]}
+        rows = [row for case in CASES for row in case(recorder)]
+        return {"rows": rows, "memory": [_memory(recorder, name) for name in SCENES]}
 
 
-def make_views(count: int) -> Views:
+def make_views(count: int, height: int = 64, width: int = 96) -> Views:
     lens = torch.tensor([[50.0, 0, 48], [0, 50, 32], [0, 0, 1]]).repeat(count, 1, 1)
-    cameras = Cameras(lens, torch.eye(4).repeat(count, 1, 1), 64, 96)
-    return Views(cameras, torch.full((count, 3, 64, 96), 0.5))
+    cameras = Cameras(lens, torch.eye(4).repeat(count, 1, 1), height, width)
+    return Views(cameras, torch.full((count, 3, height, width), 0.5))
 
 
-def make_gaussians(needed: bool) -> Gaussians:
-    num = 2048
+def make_gaussians(needed: bool, num: int = 2048, degree: int = 1) -> Gaussians:
     fields = (torch.zeros(num, 3), torch.ones(num, 4), torch.ones(num, 3), torch.full((num,), 0.5))
-    return Gaussians(*(field.requires_grad_(needed) for field in (*fields, torch.zeros(num, 4, 3))))
+    fields += (torch.zeros(num, (degree + 1) ** 2, 3),)
+    return Gaussians(*(field.requires_grad_(needed) for field in fields))
 
 
 def _render(recorder: Recorder) -> list[Result]:
@@ -173,12 +216,36 @@ def _step(recorder: Recorder) -> list[Result]:
     return rows
 
 
+def _memory(recorder: Recorder, name: str) -> Result:
+    num, degree, height, width = SCENES[name]
+    gaussians = make_gaussians(True, num, degree)
+    cameras = make_views(1, height, width).cameras
+
+    def fill(arguments: dict[str, Any]) -> None:
+        recorder.launches.clear()  # they hold their tensors
+        if arguments.get("WRITE") is False:
+            arguments["counts"].fill_(5)
+        elif "tile_of" in arguments:
+            tile_of = arguments["tile_of"].numpy()  # so that nothing here is counted
+            tile_of[:] = np.linspace(0, arguments["tiles"] - 1, len(tile_of))
+
+    recorder.fills[:] = [fill]
+    with _Memory() as memory:
+        image = render(gaussians, cameras, depth=False).image
+        kept = memory.now
+        torch.autograd.grad(image, list(vars(gaussians).values()), torch.ones_like(image))
+    return {"scene": name, "kept": kept, "peak": memory.peak}
+
+
 CASES: tuple[Callable[[Recorder], list[Result]], ...] = (_render, _step)
 
 
 def tables(results: Result) -> list[Table]:
     """Show the counts."""
-    return [make_table("Launches on a GPU", COLUMNS, results["rows"], NOTES)]
+    return [
+        make_table("Launches on a GPU", COLUMNS, results["rows"], NOTES),
+        make_table("Memory of both passes", MEMORY_COLUMNS, results["memory"], MEMORY_NOTES),
+    ]
 
 
 COLUMNS = {
@@ -187,4 +254,9 @@ COLUMNS = {
     "kernels": number_column("kernels", "{:,.0f}"),
     "together": number_column("launches", "{:,.0f}"),
     "waits": number_column("waits", "{:,.0f}"),
+}
+MEMORY_COLUMNS = {
+    "": text_column("{scene}"),
+    "kept": number_column("kept", "{:,.0f}", unit=1e6),
+    "peak": number_column("peak", "{:,.0f}", unit=1e6),
 }

@@ -13,6 +13,7 @@ FUSED = {"enable_fp_fusion": True}
 # Sizes that change within a run, as Gaussians are added and views are selected. Triton would
 # compile a kernel again whenever one becomes 1, a multiple of 16 or neither.
 CHANGING = {"num", "num_visible", "num_splats", "views", "first", "length", "chunks"}
+CHANGING |= {"room", "first_tile", "end_tile"}
 
 
 def kernel(function: Callable) -> Callable:

@@ -1,5 +1,6 @@
 """Progress of a refinement in the terminal and the browser, and how it is stopped."""
 
+import math
 import os
 import signal
 import time
@@ -12,7 +13,8 @@ from asysplat.refinement.refine import Refinement, RefinementProgress, Refining
 from asysplat.scene import Gaussians
 from asysplat.terminal import make_console
 
-VIEWER_SECONDS = 1.0  # between two updates of the viewer
+BAR_SECONDS = 0.1  # between two updates of the bar
+VIEWER_SECONDS = 1.0  # and of the viewer
 PRINT_SECONDS = 10.0  # between two lines where there is no terminal
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -29,6 +31,7 @@ class RefinementDisplay:
         self.stopped = False
         self._terminal = make_console().is_terminal
         self._printed = self._shown = time.monotonic()
+        self._updated = -math.inf
         self._viewer = viewer
         if viewer is not None:
             print(f"viewer: {viewer.url}")
@@ -55,10 +58,13 @@ class RefinementDisplay:
     def __call__(self, progress: RefinementProgress, refinement: Refining) -> bool:
         """Show the progress, and Gaussians that all views share; return whether to stop."""
         self.last = progress
+        clock = time.monotonic()
+        if clock - self._updated < BAR_SECONDS and progress.fraction < 1:
+            return self.stopped  # the PSNR would wait for a GPU in every step
+        self._updated = clock
         quality = f"PSNR {progress.psnr:.2f} dB"
         text = f"step {progress.step}, {quality}, {progress.gaussians:,} Gaussians"
         self._bar.update(self._task, completed=progress.fraction, text=text)
-        clock = time.monotonic()
         if not self._terminal and clock - self._printed > PRINT_SECONDS:
             self._printed = clock
             print(f"{progress.seconds:.0f} s: {text}", flush=True)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.kernels.host import copy_to
 from asysplat.ops.adam import AdamSettings, Rows, adam_step
 
 
@@ -69,11 +70,10 @@ class SelectiveAdam:
                 row_rates[name] = numbers
         if not row_rates:
             return
-        # One transfer for all, as a GPU waits for each.
         sizes = [len(numbers) for numbers in row_rates.values()]
         dtype = next(iter(self.parameters.values())).dtype
         together = np.concatenate([*row_rates.values()]).tolist()
-        moved = torch.tensor(together, dtype=dtype, device=visible.device).split(sizes)
+        moved = copy_to(visible.device, together, dtype).split(sizes)
         tensors = []
         for name, numbers in zip(row_rates, moved, strict=True):
             parameter, state = self.parameters[name], self._state[name]

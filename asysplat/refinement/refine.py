@@ -46,8 +46,13 @@ class RefinementProgress:
     step: int  # steps so far
     fraction: float  # fraction of the refinement that is done, in [0, 1]
     seconds: float  # seconds of its steps so far, without what watches it
-    psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
+    errors: Sequence[Float[Tensor, ""]]  # squared, of the last steps, one for each input image
+
+    @cached_property
+    def psnr(self) -> float:
+        """PSNR of the last steps, each before its update; a GPU is waited for, as it is read."""
+        return -10 * math.log10(max(float(torch.stack([*self.errors]).double().mean()), 1e-10))
 
 
 @runtime_checkable
@@ -59,7 +64,7 @@ class Refining(Protocol):
     @property
     def num_gaussians(self) -> int: ...
 
-    def advance(self, progress: float) -> float:
+    def advance(self, progress: float) -> Float[Tensor, ""]:
         """Take a step at a progress in [0, 1]; return its mean squared error."""
         ...
 
@@ -115,7 +120,7 @@ class Refinement:
     def num_gaussians(self) -> int:
         return len(self.fields)
 
-    def advance(self, progress: float) -> float:
+    def advance(self, progress: float) -> Float[Tensor, ""]:
         """Densify where that is due, then take a step; see `step`."""
         settings, schedule = self.settings, self.settings.every
         if progress < settings.densify_until:
@@ -127,7 +132,7 @@ class Refinement:
                 self.reset_opacities()
         return self.step(progress)
 
-    def step(self, progress: float) -> float:
+    def step(self, progress: float) -> Float[Tensor, ""]:
         """Take a step at a progress in [0, 1]; return its mean squared error."""
         settings, views = self.settings, self._views(progress)
         chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
@@ -135,7 +140,7 @@ class Refinement:
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
         cooled = max(0.0, (progress - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled
-        error, sums = 0.0, ()
+        errors, sums = [], ()
         for view in chosen:
             # A slice copies nothing and waits for no GPU.
             one = views.map(itemgetter(slice(view, view + 1)))
@@ -143,7 +148,7 @@ class Refinement:
             mse, of_view = self._gradients(target, background, view, leaves, factor)
             self._densifier.observe_view(of_view[0], target.cameras)
             sums = list(map(torch.add, sums, of_view)) if sums else of_view
-            error += mse / len(chosen)
+            errors.append(mse)
         gradients = dict(zip(leaves, sums, strict=True))
         every = settings.every
         degree = MAX_SH_DEGREE if every is None else self._steps // every.sh_degree
@@ -153,7 +158,7 @@ class Refinement:
         if settings.opacity_decay < 1 and progress < 1 - cool_down:
             self.fields.decay_opacities(settings.opacity_decay)
         self._steps += 1
-        return error
+        return errors[0] if len(errors) == 1 else torch.stack(errors).mean()
 
     def densify(self, progress: float, number: int = 1) -> None:
         """Prune, add or relocate Gaussians, by the settings' method; `number` counts the rounds."""
@@ -193,7 +198,7 @@ class Refinement:
         view: int,
         leaves: Parameters,
         factor: float,
-    ) -> tuple[float, Sequence[Tensor]]:
+    ) -> tuple[Tensor, Sequence[Tensor]]:
         """Render a view and update its corrections; return its MSE and the leaves' gradients."""
         cameras, correction = target.cameras, self.corrections.leaves()
         if correction:
@@ -216,7 +221,7 @@ class Refinement:
         if correction:
             correction_gradients = dict(zip(correction, gradients[len(leaves) :], strict=True))
             self.corrections.step(view, correction_gradients, factor)
-        mse = F.mse_loss(target.masked(image.detach()), target.images).item()
+        mse = F.mse_loss(target.masked(image.detach()), target.images)
         return mse, gradients[: len(leaves)]
 
     def _views(self, progress: float) -> Views:
@@ -293,7 +298,7 @@ def run_steps(
     max_steps: float = math.inf,
 ) -> None:
     """Advance a refinement to the end of its budget, or for `max_steps`; see `refine`."""
-    errors: deque[float] = deque(maxlen=refinement.views.num_views)
+    errors: deque[Tensor] = deque(maxlen=refinement.views.num_views)
     step, progress = 0, 0.0
     passed = 0.0
     while progress < 1:
@@ -303,8 +308,8 @@ def run_steps(
         step += 1
         used = (passed if budget.timed else step) / budget.amount
         progress = min(1.0, max(used, step / max_steps))
-        psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
-        status = RefinementProgress(step, progress, passed, psnr, refinement.num_gaussians)
+        count, latest = refinement.num_gaussians, tuple(errors)
+        status = RefinementProgress(step, progress, passed, count, latest)
         if watch is not None and watch(status, refinement):
             break
 

@@ -256,7 +256,7 @@ class ScaffoldRefinement:
     def num_gaussians(self) -> int:
         return self.scene.num_gaussians
 
-    def advance(self, progress: float) -> float:
+    def advance(self, progress: float) -> Float[Tensor, ""]:
         """Grow and prune anchors where that is due, then take a step; return its squared error."""
         settings, steps = self.settings, self._steps
         growing = progress < settings.densify_until
@@ -266,7 +266,7 @@ class ScaffoldRefinement:
         self._steps += 1
         return self.step(progress, observing)
 
-    def step(self, progress: float, observing: bool) -> float:
+    def step(self, progress: float, observing: bool) -> Float[Tensor, ""]:
         """Take a step on one view; return its mean squared error."""
         scene, target = self.scene, self.views.select([next(self._view_order)])
         camera = target.cameras
@@ -292,7 +292,7 @@ class ScaffoldRefinement:
         scene.optimizer.step(of_anchors, rates, seen)
         if observing:
             self._statistics.observe(decoded, of_means, camera)
-        return F.mse_loss(target.masked(image.detach()), target.images).item()
+        return F.mse_loss(target.masked(image.detach()), target.images)
 
     @torch.no_grad()
     def densify(self) -> None:

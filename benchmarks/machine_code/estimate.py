@@ -16,6 +16,7 @@ from asysplat.rendering.cuda.draw import (
     BACKWARD_BLOCK,
     BACKWARD_STEP,
     BLOCK,
+    ENTRY_BLOCK,
     FORWARD_STEP,
     SUM_BLOCK,
 )
@@ -85,6 +86,7 @@ def measure_work(scene: Scene) -> RenderingWork:
         programs={
             "project": math.ceil(num / BLOCK),
             "list_tiles": math.ceil(visible / BLOCK),  # others end at once
+            "list_entries": math.ceil(pairs / ENTRY_BLOCK),
             "rasterize": tiles,
             "rasterize_backward": tiles,
             "sum_pairs": math.ceil(num / SUM_BLOCK),
@@ -93,6 +95,7 @@ def measure_work(scene: Scene) -> RenderingWork:
         rounds={
             "project": (1.0,),
             "list_tiles": (1.0, rows, rows * columns, 0.0),
+            "list_entries": (1.0,),
             "rasterize": (1.0, steps["rasterize"]),
             "rasterize_backward": (1.0, steps["rasterize_backward"], 0.0),
             "sum_pairs": (1.0, math.ceil(counts / PAIRS.value)),
@@ -101,10 +104,11 @@ def measure_work(scene: Scene) -> RenderingWork:
         bytes={
             "project": NUMBER * num * (fields + SPLAT.value + 1),
             "list_tiles": NUMBER * (visible * SPLAT.value + 4 * num) + 6 * pairs,
+            "list_entries": NUMBER * pairs * 5,
             "rasterize": NUMBER * (visible * SPLAT.value + pairs + 7 * pixels),
             "rasterize_backward": NUMBER
-            * (visible * SPLAT.value + pairs * (3 + GRADIENT.value) + 7 * pixels),
-            "sum_pairs": NUMBER * (num * 2 + pairs * GRADIENT.value),
+            * (visible * SPLAT.value + pairs * GRADIENT.value + 7 * pixels),
+            "sum_pairs": NUMBER * (num * 2 + (pairs + visible) * GRADIENT.value),
             "project_backward": NUMBER * num * (2 * fields + 2 + GRADIENT.value),
         },
         pairs=pairs,

@@ -13,22 +13,27 @@ from asysplat.rendering import render
 from benchmarks import launches
 
 MOST = {  # launches and waits
-    "render": (13, 1),  # waits for the number of pairs
+    "render": (13, 1),  # the number of pairs, when a GPU has been given all its work
     "render, with a graph": (13, 1),
     "its gradient": (5, 0),
-    "step of a refinement": (142, 3),  # waits for it, the learning rates, and the error
-    "with known depths": (184, 3),
+    "step of a refinement": (141, 1),
+    "with known depths": (183, 1),
 }
+MOST_MEGABYTES = {"100,000 Gaussians, 540x960": 53, "1 million, 1080x1920": 315}
 
 
-def test_no_more_launches_and_waits_than_today(make_options):
+def test_no_more_launches_waits_and_memory_than_today(make_options, monkeypatch):
+    scenes = {name: launches.SCENES[name] for name in MOST_MEGABYTES}
+    monkeypatch.setattr(launches, "SCENES", scenes)
     results = launches.measure(make_options("launches", {}), Console(quiet=True))
     found = {row["case"]: (row["launches"], row["waits"]) for row in results["rows"]}
     assert found.keys() == MOST.keys()
     for case, (most, waits) in MOST.items():
         assert found[case][0] <= most and found[case][1] <= waits, case
-    (table,) = launches.tables(results)
-    assert table.row_count == len(MOST)
+    for row, most in zip(results["memory"], MOST_MEGABYTES.values(), strict=True):
+        assert 0 < row["kept"] < row["peak"] <= most * 1e6
+    counts, memory = launches.tables(results)
+    assert (counts.row_count, memory.row_count) == (len(MOST), len(MOST_MEGABYTES))
 
 
 def test_statistics_wait_when_they_are_read():
@@ -48,5 +53,5 @@ def test_what_is_counted():
         values = torch.ones(2)[None].squeeze(0)  # one launch
         values = values[mask]  # one, which waits
         values.sum().item()  # two, one waits
-        torch.tensor([1.0])  # a copy, which waits
+        torch.tensor([1.0], device="cpu")  # a copy, which waits
     assert (counts.operators, counts.waits, counts.kernels) == (5, 3, 0)

@@ -109,11 +109,11 @@ def test_our_rows_stand_between_published_ones_and_are_kept(
         return open_published(*options)
 
     monkeypatch.setattr(report, "open_published", opening)
-    public = {"marks": [0.05, 0.1], "curve_views": 1, "images": {}, "ours": {"sh_degree": 0}}
+    public = {"marks": [0.05, 0.5], "curve_views": 1, "images": {}, "ours": {"sh_degree": 0}}
     options = make_options("public", {"public": public, "data": {"root": str(fern.parent)}})
     options.output = str(tmp_path)
     first = report.measure(options, Console(quiet=True))
-    assert [row["mark"] for row in first["rows"]] == [None, 0.05, 0.1] and len(opened) == 1
+    assert [row["mark"] for row in first["rows"]] == [None, 0.05, 0.5] and len(opened) == 1
     assert [row["views"] for row in first["rows"]] == [1, 1, 2]
     assert first["rows"][0]["psnr"] < first["rows"][-1]["psnr"]
     assert len(list((tmp_path / "public").glob("small-fern-*.png"))) == 1

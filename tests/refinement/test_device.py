@@ -16,6 +16,7 @@ def scene():
     """Gaussians, and photographs of noise with masks."""
     gaussians = small_scene(60)
     gaussians.opacities[:] = torch.linspace(0.001, 0.9, 60)
+    gaussians.scales.fill_(0.03)  # far from the limit above which they are pruned
     return gaussians, replace(small_views(3), masks=torch.rand(3, 12, 15) > 0.1)
 
 

@@ -222,31 +222,33 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
 
     found = []
 
-    def keep(frame, splats, depths, *args):
-        found.append((depths, list_tiles(frame, splats, depths, *args)))
+    def keep(frame, pairs, room, settings, keep, active):
+        found.append((pairs, list_pairs(frame, pairs, room, settings, True, active)))
         return found[-1][-1]
 
-    list_tiles = module._list_tiles
-    monkeypatch.setattr(module, "_list_tiles", keep)
+    list_pairs = module._list_pairs
+    monkeypatch.setattr(module, "_list_pairs", keep)
+    monkeypatch.setattr(module, "_room", {})
     scene = make_batch(make_scene, views=2, count=60, height=45, width=50)
     if shape == "needles":  # thin and long, the centers of most far outside the image
         scene[0].scales.mul_(torch.tensor([100, 0.05, 0.05]))
         scene[0].means[..., :2].mul_(20)
     stats = draw_by_cuda(*(part.to(DEVICE) for part in scene), RenderSettings()).stats
-    ((depths, (lists, _)),) = found
-    splats = lists.splats
+    ((pairs, lists),) = found
+    splats, depths = pairs.splats, pairs.depths
     rows, columns, size = 6, 7, 8
     tiles = rows * columns
-    pairs = lists.first_entry.diff()
-    assert (pairs >= 0).all() and pairs.sum() == stats["pairs"] == len(lists.entries)
-    tile, entries = torch.repeat_interleave(pairs), lists.entries.long()
+    lengths = lists.first_entry.diff()
+    assert (lengths >= 0).all() and lengths.sum() == stats["pairs"] == len(lists.entries)
+    tile, entries = torch.repeat_interleave(lengths), lists.entries.long()
     assert torch.equal(tile // tiles, entries // 60)
     # Each tile's list is by depth.
     assert (depths[entries].diff()[tile.diff() == 0] >= 0).all()
     # The pairs of a splat are numbered one after the other.
-    assert torch.equal(lists.pairs.sort()[0], torch.arange(len(entries), device=DEVICE))
+    numbers = lists.places.long().argsort()
+    assert torch.equal(lists.places.long()[numbers], torch.arange(len(entries), device=DEVICE))
     counts = torch.bincount(entries, minlength=len(splats))
-    ranks = lists.pairs - lists.first_pair[entries]
+    ranks = numbers - lists.first_pair[entries]
     assert (ranks >= 0).all() and (ranks < counts[entries]).all()
 
     # On a grid eight times as fine as pixels, between the outermost pixel centers of each tile.
@@ -267,6 +269,51 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
     listed = listed[counts.cpu() > 0]
     assert touched.any() and listed[touched].all()
     assert listed.sum() <= 1.05 * touched.sum()
+
+
+@kernel
+def test_pairs_beyond_the_room_are_drawn_again(make_scene, monkeypatch):
+    from asysplat.rendering.cuda import draw as module
+
+    monkeypatch.setattr(module, "_room", {})
+    scene, settings = make_batch(make_scene, scenes=2, views=2, device=DEVICE), RenderSettings()
+    images, grads, stats = run(draw_by_cuda, *scene, settings)
+    ((similar, room),) = module._room.items()
+    assert room > stats["pairs"] > 16
+    for others in (16, 10 * room):  # of the images before
+        monkeypatch.setattr(module, "_room", {similar: others})
+        other = run(draw_by_cuda, *scene, settings)
+        assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]]))
+        assert other[2] == stats
+        assert stats["pairs"] < module._room[similar] <= max(room, others)
+
+
+@kernel
+@pytest.mark.parametrize("parts", [3, 1000])
+def test_gradients_of_a_group_of_tiles_at_a_time(make_scene, monkeypatch, parts):
+    """Several tiles, or one alone, as it has more pairs than a group should have."""
+    from asysplat.rendering.cuda import draw as module
+
+    scene, settings = make_batch(make_scene, views=2, device=DEVICE), RenderSettings()
+    images, grads, stats = run(draw_by_cuda, *scene, settings)
+    most = 1 + stats["pairs"] // parts
+    monkeypatch.setattr(module, "MOST_ROWS", most)
+    groups = []
+
+    def keep(*args):
+        groups.append(group_tiles(*args))
+        return groups[-1]
+
+    group_tiles = module._group_tiles
+    monkeypatch.setattr(module, "_group_tiles", keep)
+    other = run(draw_by_cuda, *scene, settings)
+    ((bounds, rows),) = groups
+    assert len(bounds) > 3 and bounds[0] == 0 and bounds == sorted(set(bounds))
+    assert bounds[-1] == 2 * -(-scene[1].height // 8) * -(-scene[1].width // 8)
+    assert most / 2 < rows < stats["pairs"] / 2
+    assert all(map(torch.equal, images, other[0]))
+    for grad, whole in zip(other[1], grads, strict=True):
+        torch.testing.assert_close(grad, whole, rtol=1e-6, atol=1e-6 * float(whole.abs().max()))
 
 
 @kernel

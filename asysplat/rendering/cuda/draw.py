@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,13 +12,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.kernels.host import HostCopy
 from asysplat.kernels.triton_utils import INTERPRETED
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.project import COUNTERS, pack_cameras, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
 from asysplat.rendering.cuda.rasterize import SavedForBackward, rasterize, rasterize_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
-from asysplat.rendering.cuda.tiles import TileLists, list_tiles
+from asysplat.rendering.cuda.tiles import TileLists, list_entries, list_tiles
 from asysplat.rendering.formulas import KernelInputs
 from asysplat.rendering.interface import (
     RenderOutputs,
@@ -30,11 +33,36 @@ from asysplat.scene import Cameras, Gaussians
 BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
 SUM_BLOCK = 32  # splats of a program, whose pairs are summed
+ENTRY_BLOCK = 256  # pairs of a program
+MOST_ROWS = 2**22  # gradients of pairs in memory at a time
 # Splats of a step. In the interpreter an invalid splat takes as long as a valid one.
 FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (4, 2)
 # A tile's 64 pixels are two for each lane of one warp: sums stay within it.
 RASTER_OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 PROJECT_OPTIONS = {"enable_fp_fusion": False}
+
+# Pairs that the last images of a size had, and some more.
+_room: dict[tuple[torch.device, int, int, int], int] = {}
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Splats and their pairs with tiles, counted and not yet listed."""
+
+    splats: Tensor
+    depths: Tensor  # [images * N] infinite where there is no splat
+    order: Tensor  # [images * N] splats by depth
+    counts: Tensor  # [images * N] tiles of each splat
+    ends: Tensor  # [images * N] 1 + the index of a splat's last pair, in `order`
+    box_tiles: Tensor  # [programs] tiles that boxes of splats would touch
+    last_end: HostCopy
+
+    @cached_property
+    def number(self) -> int:
+        """The number of pairs, for which the host waits."""
+        number = sum(self.last_end.read().tolist())  # there is none without Gaussians
+        check_pairs(number)
+        return number
 
 
 def draw(
@@ -64,13 +92,17 @@ class _Passes(torch.autograd.Function):
             rows = _pack_cameras(frame, *tensors[5:], settings)
             inputs = _inputs(tensors, rows)
             splats, depths, counters = _project(frame, inputs, settings)
-            lists, box_tiles = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
-            images, saved = _rasterize(frame, lists, settings)
-        counted = (lists.first_entry, saved.last_entry, lists.active, lists.counts)
-        counted += (counters, box_tiles if settings.culling.ellipse else None, len(lists.entries))
+            pairs = _count_pairs(frame, splats, depths, settings)
+            active = None if masks is None else formulas.active_tiles(masks, TILE.value)
+            keep = any(ctx.needs_input_grad)
+            lists, images, saved = _draw_pairs(frame, pairs, settings, keep, active)
+            many = keep and pairs.number > MOST_ROWS
+            ctx.first_entry = HostCopy(lists.first_entry) if many else None
+        counted = (lists.first_entry, saved.last_entry, lists.active, lists.counts, counters)
+        counted += (pairs.box_tiles if settings.culling.ellipse else None, pairs.number)
         stats = RenderStatistics(partial(_count, *counted))
         ctx.save_for_backward(*tensors, rows, *lists, *saved)
-        ctx.settings, ctx.frame = settings, frame
+        ctx.settings, ctx.frame, ctx.pairs = settings, frame, pairs.number
         ctx.set_materialize_grads(False)
         if saved.origins is not None:
             ctx.mark_non_differentiable(saved.origins)
@@ -88,34 +120,20 @@ class _Passes(torch.autograd.Function):
         )
         if grad_depth is None and settings.depth is not None:
             grad_depth = torch.zeros_like(saved.transmittance)
+        grad_depth = None if grad_depth is None else grad_depth.contiguous()
         with torch.cuda.device_of(lists.splats):
-            pair_grads = lists.splats.new_empty(len(lists.entries), GRADIENT.value)
-            rasterize_backward[(frame.images * frame.tiles,)](
-                splats=lists.splats,
-                entries=lists.entries,
-                pairs=lists.pairs,
-                first_entry=lists.first_entry,
-                **saved._asdict(),
-                grad_image=grad_image,
-                grad_transmittance=grad_transmittance,
-                grad_depth=None if grad_depth is None else grad_depth.contiguous(),
-                grads=pair_grads,
-                **frame.grid,
-                alpha_min=settings.limits.alpha_min,
-                alpha_max=settings.limits.alpha_max,
-                **_kinds(settings),
-                STEP=BACKWARD_STEP,
-                **RASTER_OPTIONS,
-            )
+            arriving = (grad_image, grad_transmittance, grad_depth)
+            groups = _group_tiles(frame, ctx.pairs, ctx.first_entry)
+            splat_grads = _rasterize_backward(frame, lists, saved, arriving, settings, *groups)
             inputs = _inputs(tensors, rows)
             needs = {
                 "SH_NEEDED": ctx.needs_input_grad[8],
                 "CAMERAS_NEEDED": any(ctx.needs_input_grad[9:]),
             }
-            grads = _project_backward(frame, inputs, lists, pair_grads, settings, needs)
+            grads = _project_backward(frame, inputs, lists.counts, splat_grads, settings, needs)
         centers = None
         if ctx.needs_input_grad[3]:
-            centers = _center_gradients(frame, lists, pair_grads)
+            centers = _center_gradients(frame, lists.counts, splat_grads)
         poses = (None, None)
         if grads.cameras is not None:
             poses = formulas.camera_gradients(grads.cameras.sum(1), *tensors[5:])
@@ -206,51 +224,89 @@ def _project(
     return splats, depths, counters
 
 
-def _list_tiles(
-    frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, cull_ellipse: bool
-) -> tuple[TileLists, Tensor]:
-    """Sort the pairs by tile and depth; also count the tiles that boxes of splats would touch.
-
-    Depths [images * N] are infinite where there is no splat. With `cull_ellipse`, tiles of a box
-    that the ellipse does not touch are left out.
-    """
-    tiles, device = frame.images * frame.tiles, splats.device
+def _count_pairs(frame: Frame, splats: Tensor, depths: Tensor, settings: RenderSettings) -> Pairs:
+    """Sort the splats by depth, and count the tiles of each and of its box."""
     # By depth across all images; the sort by tile separates the images. What is no splat comes
     # last: to leave it out, the host would have to wait for the number of splats.
     order = torch.argsort(depths, stable=True)
-    programs = (-(-len(order) // BLOCK),)
-    counts = torch.empty(len(depths), dtype=torch.int32, device=device)
-    box_tiles = torch.empty(programs, dtype=torch.int32, device=device)
-    first_pair = torch.empty_like(counts)
-    common = {"splats": splats, "depths": depths, "order": order, "counts": counts}
-    common |= {"total": len(order)}
-    common |= {"num": frame.num, "CULL_ELLIPSE": cull_ellipse, "BLOCK": BLOCK}
-    common |= frame.grid | PROJECT_OPTIONS
-    if len(order):
-        unused = dict.fromkeys(("ends", "tile_of", "owners", "first_pair"))
-        list_tiles[programs](box_tiles=box_tiles, **unused, **common, WRITE=False)
+    counts = torch.empty(len(order), dtype=torch.int32, device=splats.device)
+    box_tiles = counts.new_empty(-(-len(order) // BLOCK))
+    _visit_tiles(frame, settings, splats, depths, order, counts, box_tiles=box_tiles)
     ends = counts[order].cumsum(0)
-    pairs = int(ends[-1]) if len(order) else 0
-    check_pairs(pairs)
-    # A GPU sorts short keys in fewer passes.
-    key = next(t for t in (torch.int16, torch.int32, torch.int64) if tiles <= torch.iinfo(t).max)
-    tile_of = torch.empty(pairs, dtype=key, device=device)
-    owners = torch.empty(pairs, dtype=torch.int32, device=device)
-    if pairs:
-        places = {"ends": ends, "tile_of": tile_of, "owners": owners, "first_pair": first_pair}
-        list_tiles[programs](box_tiles=None, **places, **common, WRITE=True)
+    return Pairs(splats, depths, order, counts, ends, box_tiles, HostCopy(ends[-1:]))
+
+
+def _draw_pairs(
+    frame: Frame, pairs: Pairs, settings: RenderSettings, keep: bool, active: Tensor | None
+) -> tuple[TileLists, tuple[Tensor | None, ...], SavedForBackward]:
+    """List the pairs and draw them; again, if they are more than there was room for."""
+    similar = (pairs.splats.device, frame.images, frame.height, frame.width)
+    room, drawn = _room.get(similar) or pairs.number, False
+    while not drawn:
+        lists = _list_pairs(frame, pairs, room, settings, keep, active)
+        images, saved = _rasterize(frame, lists, settings)
+        # A GPU knows the number long before it has drawn, and has work while the host waits.
+        drawn, room = pairs.number <= room, max(pairs.number, room)
+    _room[similar] = max(pairs.number + pairs.number // 8, room - room // 64)
+    return lists, images, saved
+
+
+def _list_pairs(
+    frame: Frame,
+    pairs: Pairs,
+    room: int,
+    settings: RenderSettings,
+    keep: bool,
+    active: Tensor | None,
+) -> TileLists:
+    """Sort pairs, at most `room` of them, by tile and depth; `keep` what gradients need."""
+    tiles, counts = frame.images * frame.tiles, pairs.counts
+    # A GPU sorts short keys in fewer passes. Room that no pair takes comes last.
+    key = next(t for t in (torch.int16, torch.int32, torch.int64) if tiles < torch.iinfo(t).max)
+    tile_of = torch.full((room,), torch.iinfo(key).max, dtype=key, device=counts.device)
+    owners, first_pair = counts.new_empty(room), torch.empty_like(counts)
+    places = {"tile_of": tile_of, "owners": owners, "first_pair": first_pair, "room": room}
+    visited = (pairs.splats, pairs.depths, pairs.order, counts)
+    _visit_tiles(frame, settings, *visited, ends=pairs.ends, **places)
     tile_of, numbers = torch.sort(tile_of, stable=True)
-    starts = torch.arange(tiles + 1, dtype=key, device=device)
-    lists = TileLists(
-        splats=splats,
-        counts=counts,
-        first_pair=first_pair,
-        first_entry=torch.searchsorted(tile_of, starts),
-        entries=owners[numbers],
-        pairs=numbers,
-        active=None if masks is None else formulas.active_tiles(masks, TILE.value),
-    )
-    return lists, box_tiles
+    entries, places = torch.empty_like(owners), torch.empty_like(owners) if keep else None
+    if room:
+        list_entries[(-(-room // ENTRY_BLOCK),)](
+            numbers, owners, entries, places, room, KEEP=keep, BLOCK=ENTRY_BLOCK
+        )
+    starts = torch.arange(tiles + 1, dtype=key, device=counts.device)
+    first_entry = torch.searchsorted(tile_of, starts)
+    return TileLists(pairs.splats, counts, first_pair, first_entry, entries, places, active)
+
+
+def _visit_tiles(
+    frame: Frame,
+    settings: RenderSettings,
+    splats: Tensor,
+    depths: Tensor,
+    order: Tensor,
+    counts: Tensor,
+    box_tiles: Tensor | None = None,
+    **pairs: Tensor | int,
+) -> None:
+    """Count the pairs, or list them, if there is where to; see `list_tiles`."""
+    unused = {"ends": None, "tile_of": None, "owners": None, "first_pair": None, "room": 0}
+    if len(order):
+        list_tiles[(-(-len(order) // BLOCK),)](
+            splats=splats,
+            depths=depths,
+            order=order,
+            counts=counts,
+            box_tiles=box_tiles,
+            **unused | pairs,
+            total=len(order),
+            num=frame.num,
+            **frame.grid,
+            WRITE=bool(pairs),
+            CULL_ELLIPSE=settings.culling.ellipse,
+            BLOCK=BLOCK,
+            **PROJECT_OPTIONS,
+        )
 
 
 def _rasterize(
@@ -318,17 +374,86 @@ def _count(
     }
 
 
+def _group_tiles(frame: Frame, pairs: int, first_entry: HostCopy | None) -> tuple[list[int], int]:
+    """Group the tiles by equal shares of the pairs, about MOST_ROWS at most.
+
+    Return the first tile of each group and the end, and the most pairs of a group. There is one
+    group without `first_entry`.
+    """
+    tiles = frame.images * frame.tiles
+    if first_entry is None:
+        return [0, tiles], pairs
+    groups, first = -(-pairs // MOST_ROWS), first_entry.read()
+    shares = torch.arange(1, groups) * pairs // groups
+    bounds = sorted({0, *torch.searchsorted(first, shares).tolist(), tiles})
+    return bounds, int(first[bounds].diff().max())
+
+
+def _rasterize_backward(
+    frame: Frame,
+    lists: TileLists,
+    saved: SavedForBackward,
+    arriving: tuple[Tensor, Tensor, Tensor | None],
+    settings: RenderSettings,
+    bounds: list[int],
+    most: int,
+) -> Float[Tensor, "splats channels"]:
+    """Compute the gradients of the splats: those of their pairs, a group of tiles at a time.
+
+    `arriving` are the gradients of image, transmittance and depth; for the groups, see
+    `_group_tiles`. Without a depth, a splat's gradient has no last channel.
+    """
+    channels = GRADIENT.value - (settings.depth is None)
+    rows = lists.splats.new_empty(most, channels)
+    sums = lists.splats.new_empty(len(lists.splats), channels)
+    grad_image, grad_transmittance, grad_depth = arriving
+    for first, end in pairwise(bounds):
+        rasterize_backward[(end - first,)](
+            splats=lists.splats,
+            entries=lists.entries,
+            first_entry=lists.first_entry,
+            **saved._asdict(),
+            grad_image=grad_image,
+            grad_transmittance=grad_transmittance,
+            grad_depth=grad_depth,
+            grads=rows,
+            first_tile=first,
+            **frame.grid,
+            alpha_min=settings.limits.alpha_min,
+            alpha_max=settings.limits.alpha_max,
+            **_kinds(settings),
+            STEP=BACKWARD_STEP,
+            **RASTER_OPTIONS,
+        )
+        if len(sums):
+            sum_pairs[(-(-len(sums) // SUM_BLOCK),)](
+                counts=lists.counts,
+                first_pair=lists.first_pair,
+                places=lists.places,
+                first_entry=lists.first_entry,
+                grads=rows,
+                sums=sums,
+                num_splats=len(sums),
+                first_tile=first,
+                end_tile=end,
+                CHANNELS=channels,
+                ADD=first > 0,
+                BLOCK=SUM_BLOCK,
+                **PROJECT_OPTIONS,
+            )
+    return sums
+
+
 def _project_backward(
     frame: Frame,
     inputs: KernelInputs,
-    lists: TileLists,
-    pair_grads: Tensor,
+    counts: Tensor,
+    splat_grads: Tensor,
     settings: RenderSettings,
     needs: dict[str, bool],
 ) -> KernelInputs:
-    """Compute the gradients of the inputs from those of the pairs; None where not required."""
-    has_depth = settings.depth is not None
-    blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
+    """Compute the gradients of the inputs from those of the splats; None where not required."""
+    blocks, device = -(-frame.num // BACKWARD_BLOCK), counts.device
     shape = (frame.images, blocks, formulas.CAMERA_GRADIENT)
     sh = torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None
     cameras = None
@@ -336,27 +461,17 @@ def _project_backward(
         cameras = torch.zeros(shape, dtype=torch.float64, device=device)
     grads = KernelInputs(*map(torch.empty_like, inputs[:4]), sh, cameras)
     if blocks:
-        sum_pairs[(-(-len(lists.splats) // SUM_BLOCK),)](
-            counts=lists.counts,
-            first_pair=lists.first_pair,
-            grads=pair_grads,
-            num_splats=len(lists.splats),
-            CHANNELS=GRADIENT.value - (not has_depth),
-            BLOCK=SUM_BLOCK,
-            **PROJECT_OPTIONS,
-        )
         project_backward[(blocks, frame.images // frame.views)](
             **inputs._asdict(),
-            counts=lists.counts,
-            first_pair=lists.first_pair,
-            grads=pair_grads,
+            counts=counts,
+            grads=splat_grads,
             **{f"grad_{name}": grad for name, grad in grads._asdict().items()},
             num=frame.num,
             views=frame.views,
             eps2d=settings.limits.eps2d,
             compensation_min=settings.limits.compensation_min,
             ANTIALIASED=settings.antialiased,
-            HAS_DEPTH=has_depth,
+            HAS_DEPTH=settings.depth is not None,
             **needs,
             COUNT=frame.sh_count,
             BLOCK=BACKWARD_BLOCK,
@@ -367,10 +482,8 @@ def _project_backward(
 
 
 def _center_gradients(
-    frame: Frame, lists: TileLists, pair_grads: Float[Tensor, "P 10"]
+    frame: Frame, counts: Tensor, splat_grads: Float[Tensor, "splats channels"]
 ) -> Float[Tensor, "B V N 2"]:
-    """Read the gradients of the splats' centers, from what `sum_pairs` has left."""
-    drawn = lists.counts > 0
-    grads = lists.splats.new_zeros(len(drawn), 2)
-    grads[drawn] = math.log(2) * pair_grads[lists.first_pair[drawn].long(), :2]
+    """Return the gradients of the splats' centers, 0 where there is no splat."""
+    grads = math.log(2) * splat_grads[:, :2].where(counts[:, None] > 0, 0.0)
     return grads.view(-1, frame.views, frame.num, 2)

@@ -48,31 +48,48 @@ PAIRS = tl.constexpr(8)  # pairs of a splat that are loaded at a time
 
 
 @kernel
-def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
-    """Sum the gradients [pairs, 10] of each of BLOCK splats over its tiles, in a fixed order.
+def sum_pairs(
+    counts,
+    first_pair,
+    places,
+    first_entry,
+    grads,  # [pairs, CHANNELS] of the tiles from first_tile to end_tile, in the order of `entries`
+    sums,  # [images * N, CHANNELS]
+    num_splats,
+    first_tile,
+    end_tile,
+    CHANNELS: tl.constexpr,
+    ADD: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Sum the gradients of each of BLOCK splats over tiles, in a fixed order; ADD to those before.
 
-    The sum, of the first CHANNELS columns, replaces the gradient of the splat's first pair.
+    The sum of a splat that is in no tile is not written.
     """
     d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + d, mask=d < num_splats, other=0)
-    multiple = count > 1
-    count = tl.where(multiple, count, 0)
-    first = tl.load(first_pair + d, mask=multiple, other=0).to(tl.int64)
+    first = tl.load(first_pair + d, mask=count > 0, other=0).to(tl.int64)
+    start, end = tl.load(first_entry + first_tile), tl.load(first_entry + end_tile)
     column = tl.arange(0, COLUMNS)[None, :]
-    row = grads + GRADIENT * first[:, None] + column
+    row = sums + CHANNELS * d[:, None] + column
+    drawn = (count > 0)[:, None] & (column < CHANNELS)
     total = tl.zeros((BLOCK, COLUMNS), tl.float32)
+    if ADD:
+        total = tl.load(row, mask=drawn, other=0.0)
     error = tl.zeros((BLOCK, COLUMNS), tl.float32)
-    for start in range(0, tl.max(count, 0), PAIRS):
+    for step in range(0, tl.max(count, 0), PAIRS):
         for k in tl.static_range(PAIRS):  # loads of 8 pairs are on their way at a time
-            pair = start + k
-            valid = (pair < count)[:, None] & (column < CHANNELS)
-            value = tl.load(row + GRADIENT * pair, mask=valid, other=0.0)
+            pair = step + k
+            place = tl.load(places + first + pair, mask=pair < count, other=-1).to(tl.int64)
+            valid = ((place >= start) & (place < end))[:, None] & (column < CHANNELS)
+            grad = grads + CHANNELS * (place - start)[:, None] + column
+            value = tl.load(grad, mask=valid, other=0.0)
             # The rounding error of each sum (Knuth 1969, TwoSum).
             before = total
             total = before + value
             added = total - before
             error += (before - (total - added)) + (value - added)
-    tl.store(row, total + error, mask=multiple[:, None] & (column < CHANNELS))
+    tl.store(row, total + error, mask=drawn)
 
 
 @kernel
@@ -84,8 +101,7 @@ def project_backward(
     sh,
     cameras,
     counts,
-    first_pair,
-    grads,  # [pairs, 10] from `sum_pairs`
+    grads,  # from `sum_pairs`
     grad_means,
     grad_quats,
     grad_scales,
@@ -117,13 +133,12 @@ def project_backward(
         drawn = tl.load(counts + d, mask=valid, other=0) > 0
         if tl.max(drawn.to(tl.int32), 0) > 0:
             camera = cameras + CAMERA * image
-            first = tl.load(first_pair + d, mask=drawn, other=0).to(tl.int64)
             opacity_part, mean_part, quat_part, scale_part = splat_backward(
                 g,
                 drawn,
                 inputs=(means, quats, scales, opacities, sh),
                 camera=camera,
-                splat_grads=load_splat_grads(grads, first, drawn, HAS_DEPTH),
+                splat_grads=load_splat_grads(grads, d, drawn, HAS_DEPTH),
                 grad_sh=grad_sh,
                 grad_cameras=grad_cameras,
                 camera_offset=(image * tl.num_programs(0) + tl.program_id(0)) * CAMERA_GRADIENT,
@@ -148,11 +163,12 @@ def project_backward(
 
 
 @kernel
-def load_splat_grads(grads, first, drawn, HAS_DEPTH: tl.constexpr):
-    """Read the gradients of splats from those of their first pairs, see `sum_pairs`."""
-    row = grads + GRADIENT * first
+def load_splat_grads(grads, d, drawn, HAS_DEPTH: tl.constexpr):
+    """Read the gradients of splats; that of the depth is 0 without one."""
+    CHANNELS: tl.constexpr = GRADIENT if HAS_DEPTH else GRADIENT - 1
+    row = grads + CHANNELS * d
     out = ()
-    for k in tl.static_range(10 if HAS_DEPTH else 9):
+    for k in tl.static_range(CHANNELS):
         out = out + (tl.load(row + k, mask=drawn, other=0.0),)
     if HAS_DEPTH:
         return out

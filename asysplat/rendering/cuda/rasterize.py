@@ -151,7 +151,6 @@ def rasterize(
 def rasterize_backward(
     splats,
     entries,
-    pairs,
     first_entry,
     last_entry,
     transmittance,
@@ -162,6 +161,7 @@ def rasterize_backward(
     grad_transmittance,
     grad_depth,
     grads,
+    first_tile,
     columns,
     tiles,
     height,
@@ -172,8 +172,12 @@ def rasterize_backward(
     MEDIAN: tl.constexpr,
     STEP: tl.constexpr,
 ):
-    """Compute the gradients [pairs, 10] of every pair in the tile; see `cpu.rasterize`."""
-    tile = tl.program_id(0).to(tl.int64)
+    """Compute the gradients of every pair in the tile; see `cpu.rasterize`.
+
+    They follow those of the tiles from `first_tile` on: [pairs, 10], and [pairs, 9] without depth.
+    """
+    CHANNELS: tl.constexpr = GRADIENT if DEPTH or MEDIAN else GRADIENT - 1
+    tile = tl.program_id(0).to(tl.int64) + first_tile
     image_index, left, top, lane_x, lane_y, pixel, inside = tile_window(
         tile, columns, tiles, height, width
     )
@@ -193,6 +197,7 @@ def rasterize_backward(
         median_rank = tl.load(median_ranks + pixel, mask=inside, other=-1)
     first = tl.load(first_entry + tile)
     end = tl.load(last_entry + tile)
+    grads -= CHANNELS * tl.load(first_entry + first_tile)
     position = end - 1
     while position >= first:
         # Loads first: they would wait for the stores of the splat before, which they may follow.
@@ -200,13 +205,12 @@ def rasterize_backward(
         for k in tl.static_range(STEP):
             valid = position - k >= first
             d = tl.load(entries + position - k, mask=valid, other=0).to(tl.int64)
-            grad = grads + GRADIENT * tl.load(pairs + position - k, mask=valid, other=0)
             splat = load_splat(splats, d, left, top, valid) + load_color(splats, d, valid)
             if DEPTH:
                 splat = splat + load_depth(splats, d, valid)
-            rows = rows + ((valid, grad, splat),)
+            rows = rows + ((valid, splat),)
         for k in tl.static_range(STEP):
-            valid, grad, splat = rows[k]
+            valid, splat = rows[k]
             rank = (position - k - first).to(tl.int32)
             x, rest_x, y, rest_y, u = splat[0], splat[1], splat[2], splat[3], splat[4]
             a, b, c, log_opacity = splat[5], splat[6], splat[7], splat[8]
@@ -244,14 +248,15 @@ def rasterize_backward(
             colors = (tl.sum(weight * g_red, 0), tl.sum(weight * g_green, 0))
             colors = colors + (tl.sum(weight * g_blue, 0),)
             values = (2 * a * sum_eu, g_y, g_a, g_b, g_c, tl.sum(e, 0)) + colors + (g_z,)
-            store_row(grad, values, valid, 10 if DEPTH or MEDIAN else 9)
+            store_row(grads + CHANNELS * (position - k), values, valid, CHANNELS)
         position -= STEP
     # Splats behind the stop have no gradient.
     lane = tl.arange(0, TILE * TILE)
     last = tl.load(first_entry + tile + 1)
     while end < last:
         valid = end + lane < last
-        grad = grads + GRADIENT * tl.load(pairs + end + lane, mask=valid, other=0)
-        for k in tl.static_range(GRADIENT):
-            tl.store(grad + k, tl.zeros(lane.shape, tl.float32), mask=valid)
+        for k in tl.static_range(CHANNELS):
+            tl.store(
+                grads + CHANNELS * (end + lane) + k, tl.zeros(lane.shape, tl.float32), mask=valid
+            )
         end += TILE * TILE

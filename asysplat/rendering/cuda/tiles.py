@@ -1,7 +1,7 @@
 """Compute which tiles a splat touches, and the list of splats of every tile.
 
 One kernel visits the tiles of a stored splat: first to count them, then, with memory allocated for
-all pairs, to write them.
+the pairs, to write those that find room.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ class TileLists(NamedTuple):
     first_pair: Tensor  # [images * N]
     first_entry: Tensor
     entries: Tensor  # [pairs] splat of each pair, sorted by tile, then by depth
-    pairs: Tensor  # [pairs] index of each of these pairs
+    places: Tensor | None  # [pairs] where in `entries` each pair is; None without gradients
     active: Tensor | None  # None if all tiles are
 
 
@@ -40,10 +40,11 @@ def list_tiles(
     counts,  # [images * N] tiles of each splat
     box_tiles,  # [programs]
     ends,  # [images * N] 1 + the index of a splat's last pair, in `order`
-    tile_of,  # [pairs] tile of each pair
-    owners,  # [pairs] splat of each pair
+    tile_of,  # [room] tile of each pair
+    owners,  # [room] splat of each pair
     first_pair,  # [images * N]
     total,  # images * N
+    room,
     num,
     height,
     width,
@@ -74,8 +75,8 @@ def list_tiles(
         if WRITE:
             for column_step in range(tl.max(right - left, 0) + 1):
                 column = left + column_step
-                in_span = column <= right
                 pair = first + count + column_step
+                in_span = (column <= right) & (pair < room)
                 tl.store(tile_of + pair, first_tile + row * columns + column, mask=in_span)
                 tl.store(owners + pair, d.to(tl.int32), mask=in_span)
         count += right - left + 1
@@ -84,6 +85,25 @@ def list_tiles(
         left, right = box_columns(ellipse, width)
         box = (last_row - first_row + 1) * (right - left + 1)
         tl.store(box_tiles + tl.program_id(0), tl.sum(box, 0))
+
+
+@kernel
+def list_entries(
+    numbers,  # [room] pairs, sorted by tile
+    owners,
+    entries,  # [room] their splats
+    places,  # [room] the index of each pair in `numbers`; None without KEEP
+    room,
+    KEEP: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """List the splats of the tiles."""
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    exists = place < room
+    pair = tl.load(numbers + place, mask=exists, other=0)
+    tl.store(entries + place, tl.load(owners + pair, mask=exists), mask=exists)
+    if KEEP:
+        tl.store(places + pair, place.to(tl.int32), mask=exists)
 
 
 @kernel
