@@ -27,6 +27,7 @@ if __name__ == "__main__":
         with exit_with_message("stopped."):
             check_exists(Path(asked.path), "a scene, or a folder of scenes")
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 
@@ -47,6 +48,7 @@ from asysplat.refinement import (
     for_views,
     refine,
     refine_scaffold,
+    with_options,
 )
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
@@ -65,6 +67,8 @@ def reconstruct(config: DictConfig) -> None:
         raise InputError(f"no photographs: {typed('reconstruct')} my_scene, a folder.")
     check_training(OmegaConf.masked_copy(config, "speed"))
     check_options({"last_fit": config.last_fit}, {"last_fit": Fraction})
+    device = find_device(config.device)
+    config = for_device(config, device, given_options())
     limit = read_limit(config)
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
@@ -72,7 +76,6 @@ def reconstruct(config: DictConfig) -> None:
     per_view = isinstance(settings, ScaffoldSettings)
     if per_view:
         config = without_scene_files(config, given_options())
-    device = find_device(config.device)
     results = Results(Path(config.paths.run), config, per_view)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_error")
     options = {name: config[name] for name in (*names, "masks", "background")}
@@ -110,6 +113,14 @@ def reconstruct(config: DictConfig) -> None:
             results.save_scene(gaussians)
         results.save_video(gaussians)
         display.show(gaussians)
+
+
+def for_device(config: DictConfig, device: torch.device, given: set[str]) -> DictConfig:
+    """Return the configuration for a device: on a GPU more of everything, unless it is chosen."""
+    if device.type != "cuda" or config.run is not None or given & {"quality", "refinement"}:
+        return config
+    print("a GPU: quality=gpu; to avoid it, quality=good")
+    return with_options(config, "quality/gpu", given)
 
 
 def without_scene_files(config: DictConfig, given: set[str]) -> DictConfig:

@@ -16,6 +16,7 @@ from asysplat.refinement.settings import (
     RefinementSettings,
     StepSchedule,
     for_views,
+    with_options,
 )
 
 __all__ = [
@@ -34,4 +35,5 @@ __all__ = [
     "merge_to_limit",
     "refine",
     "refine_scaffold",
+    "with_options",
 ]

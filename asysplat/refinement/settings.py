@@ -112,14 +112,18 @@ def for_views(config: DictConfig, num_views: int, given: Iterable[str] = ()) -> 
     Args:
         given: names of the options that stay.
     """
-    if num_views > config.get("few_views", 0):
-        return config
-    options: Any = OmegaConf.load(CONF / "refinement" / "few.yaml")
-    del options["defaults"]
-    few: Any = OmegaConf.merge(config, options)
+    few = num_views <= config.get("few_views", 0)
+    return with_options(config, "refinement/few", given) if few else config
+
+
+def with_options(config: DictConfig, file: str, given: Iterable[str]) -> DictConfig:
+    """Return a configuration with the options of a file of conf, but for those that are given."""
+    options: Any = OmegaConf.load(CONF / f"{file}.yaml")
+    options.pop("defaults", None)
+    merged: Any = OmegaConf.merge(config, options)
     for name in given:
-        OmegaConf.update(few, name, OmegaConf.select(config, name))
-    return few
+        OmegaConf.update(merged, name, OmegaConf.select(config, name))
+    return merged
 
 
 DEFAULT: RefinementSettings = read_settings("default")

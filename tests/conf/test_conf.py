@@ -1,6 +1,7 @@
 """Every file under conf/ composes, builds its model, trains a step, and starts with its
 command."""
 
+import importlib.util
 import math
 import re
 from collections import Counter
@@ -68,6 +69,27 @@ def test_qualities_raise_everything_together(composed):
     for key in ("height", "views", "seconds", "refinement.max_gaussians"):
         values = [OmegaConf.select(config, key) or math.inf for config in configs]
         assert values == sorted(set(values)), key
+
+
+def test_a_gpu_takes_more_unless_something_is_chosen(composed, capsys):
+    spec = importlib.util.spec_from_file_location("script", ROOT / "reconstruct.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    config, gpu = (composed(f"quality={name}", script="reconstruct") for name in ("good", "gpu"))
+    cuda = torch.device("cuda")
+    taken = script.for_device(config, cuda, set())
+    for name in ("height", "seconds", "refinement"):
+        assert taken[name] == gpu[name] != config[name]
+    assert "quality=gpu; to avoid it, quality=good" in capsys.readouterr().out
+    given = {"height", "refinement.sh_degree"}
+    kept = script.for_device(config, cuda, given)
+    assert (kept.height, kept.refinement.sh_degree) == (256, 1)
+    assert (kept.seconds, kept.refinement.max_gaussians) == (30, 1_000_000)
+    for given in ({"quality"}, {"refinement"}):
+        assert script.for_device(config, cuda, given) is config
+    assert script.for_device(config, torch.device("cpu"), set()) is config
+    config.run = "last"
+    assert script.for_device(config, cuda, set()) is config
 
 
 @pytest.mark.medium
