@@ -75,6 +75,7 @@ SIZES: dict[str, dict[str, Sizes]] = {  # of the operators that each type of dev
         "grid_attention": {"batch": 1, "views": 16, "height": 16, "width": 16}
         | {"heads": 14, "head_dim": 64, "grid": 2},
         "adam": {"gaussians": 100_000},
+        "image_loss": {"images": 1, "height": 540, "width": 960},
     },
     "cpu": {
         "render": {"gaussians": 10_000, "height": 128, "width": 128},

@@ -25,7 +25,6 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.weak import WeakIdKeyDictionary
 
 from asysplat.errors import InputError
-from asysplat.ops.image_loss import image_loss
 from asysplat.refinement import DEFAULT, Refinement
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
@@ -155,13 +154,11 @@ def as_on_a_gpu() -> Iterator[Recorder]:
     """Let the operators of a block choose the GPU's kernels, which are recorded."""
     from benchmarks.machine_code.launches import keep_one_pair, recording
 
-    loss = partial(image_loss, backend="reference")
     with ExitStack() as stack:
         launches, fills = stack.enter_context(recording())
         fills[:] = [keep_one_pair]
-        for place in ("asysplat.rendering.render", "asysplat.ops.adam"):
-            stack.enter_context(patch(f"{place}.choose_fastest", lambda *_: "cuda"))
-        stack.enter_context(patch("asysplat.refinement.refine.image_loss", loss))
+        for place in ("rendering.render", "ops.adam", "ops.image_loss"):
+            stack.enter_context(patch(f"asysplat.{place}.choose_fastest", lambda *_: "cuda"))
         yield Recorder(launches, fills)
 
 

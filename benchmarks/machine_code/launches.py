@@ -11,6 +11,8 @@ from triton.runtime.jit import JITFunction
 
 from asysplat.ops.adam.cuda import adam_step_cuda
 from asysplat.ops.adam.reference import AdamSettings, Rows
+from asysplat.ops.image_loss import cuda as image_loss
+from asysplat.ops.image_loss.reference import loss_weights
 from asysplat.ops.plane_sweep import cuda as plane_sweep
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan import cuda as selective_scan
@@ -135,6 +137,13 @@ def _adam() -> None:
     adam_step_cuda(rows, torch.ones(num, dtype=torch.bool), AdamSettings(0.9, 0.999, 1e-15))
 
 
+def _image_loss(ssim_weight: float) -> None:
+    images = torch.zeros(1, 3, HEIGHT, WIDTH)
+    weights = loss_weights(HEIGHT, WIDTH, ssim_weight)
+    for keep in (False, True):
+        image_loss.compare_images(images, images, weights, keep)
+
+
 CASES: dict[str, Callable[[], None]] = {
     TRAINING: lambda: _render(0, 4, False),
     "render, refinement": lambda: _render(1, 1, False, depth=False),
@@ -147,4 +156,6 @@ CASES: dict[str, Callable[[], None]] = {
     "ssd, paper, bf16": lambda: _scan(ssd, (28, 64), 256, torch.bfloat16),
     "ssd, paper, fp16": lambda: _scan(ssd, (28, 64), 256, torch.float16),
     "adam": _adam,
+    "image loss, L1 and SSIM": lambda: _image_loss(0.2),
+    "image loss, L1": lambda: _image_loss(0.0),
 }

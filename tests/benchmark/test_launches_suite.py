@@ -16,8 +16,8 @@ MOST = {  # launches and waits
     "render": (13, 1),  # the number of pairs, when a GPU has been given all its work
     "render, with a graph": (13, 1),
     "its gradient": (5, 0),
-    "step of a refinement": (141, 1),
-    "with known depths": (183, 1),
+    "step of a refinement": (53, 1),
+    "with known depths": (95, 1),
 }
 MOST_MEGABYTES = {"100,000 Gaussians, 540x960": 53, "1 million, 1080x1920": 315}
 

@@ -35,6 +35,7 @@ KERNELS = {
     "ssd": {"sum_decays", "score_chunk", "head_gradients", "score_gradients"}
     | {"projection_gradients", *SCANS},
     "adam": {"drop_not_finite", "update_rows"},
+    "image_loss": {"compare_windows", "compare_pixels"},
 }
 MAX_STACK = 256  # bytes of a thread: registers spilled to memory
 # Hopper's TF32 products; SSD is nearly twice as fast with them on an H200.
@@ -135,6 +136,7 @@ def test_a_kernel_takes_as_long_as_its_slowest_resource():
 def test_kernels_unpack_no_tuple_within_a_tuple(repository):
     """Triton 3.6, which torch 2.11 needs, does not read `(a, b), c = ...`."""
     paths = [*(repository / "asysplat").rglob("cuda/*.py")]
+    paths += (repository / "asysplat").rglob("cuda.py")
     kernels = [
         node
         for tree in (ast.parse(path.read_text()) for path in paths)

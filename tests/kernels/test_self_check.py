@@ -13,7 +13,7 @@ from asysplat.kernels.dispatch import choose_fastest
 from asysplat.kernels.self_check import TOLERANCE, find_fault
 
 GPU = torch.device("cuda", 0)
-OPERATORS = ("adam", "ssd", "selective_scan", "plane_sweep")
+OPERATORS = ("adam", "ssd", "selective_scan", "plane_sweep", "image_loss")
 CHECKS = [f"asysplat.ops.self_check:{name}" for name in OPERATORS]
 CHECKS += ["asysplat.rendering.self_check:render"]
 
@@ -104,7 +104,7 @@ def test_our_kernels_are_right(check):
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("check", [*CHECKS, "asysplat.ops.self_check:image_loss"])
+@pytest.mark.parametrize("check", CHECKS)
 def test_kernels_of_the_processor_pass_the_same_checks(check):
     errors = self_check.resolve_name(check)(torch.device("cpu"), "cpu")
     assert 0 < max(errors.values()) < TOLERANCE / 10

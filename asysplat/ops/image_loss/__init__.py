@@ -1,19 +1,29 @@
-"""The photometric loss of 3D Gaussian splatting: L1 and SSIM (Kerbl et al. 2023)."""
+"""The photometric loss of 3D Gaussian splatting: L1 and SSIM (Kerbl et al. 2023).
+
+The backends "cpu" and "cuda" are modules of kernels, which compute the loss and its gradient at
+once.
+"""
+
+from types import ModuleType
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import (
+    KERNEL_BACKENDS,
     check_device,
     check_float,
     check_kernel_backend,
     check_shape,
+    choose_fastest,
+    load_kernels,
     look_up_backend,
     without_autocast,
 )
-from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
+from asysplat.ops.image_loss.reference import SIZE, image_loss_reference, loss_weights
 
 
 def image_loss(
@@ -36,26 +46,45 @@ def image_loss(
         ssim_weight: w in [0, 1]; at 0, SSIM is not computed.
         masks: False where a pixel is ignored: it takes the target's values, and so has no error and
             no gradient.
-        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" on a CPU
-            unless `rendered` is float64, else "reference".
+        backend: "cpu", "cuda", "reference" (torch, any device and float type), or "auto": that of
+            `rendered`'s device, "reference" for float64.
     """
     _check(rendered, target, ssim_weight, masks)
-    on_cpu = rendered.device.type == "cpu" and rendered.dtype != torch.float64
-    backends = {"auto": "cpu" if on_cpu else "reference", "reference": "reference", "cpu": "cpu"}
-    backend = look_up_backend("image_loss", backends, backend)
+    names = ("auto", "reference", *KERNEL_BACKENDS)
+    look_up_backend("image_loss", dict.fromkeys(names), backend)
+    if backend == "auto":
+        backend = choose_fastest(rendered, "reference", "asysplat.ops.self_check:image_loss")
+    elif backend != "reference":
+        check_kernel_backend("image_loss", backend, rendered)
     dtype = torch.promote_types(rendered.dtype, torch.float32)
     rendered, target = rendered.to(dtype), target.detach().to(dtype)
     if masks is not None:
         rendered = torch.where(masks[..., None, :, :], rendered, target)
     if min(rendered.shape[-2:]) < SIZE:
         ssim_weight = 0.0
-    if backend == "cpu":
-        check_kernel_backend("image_loss", backend, rendered)
-        from asysplat.ops.image_loss.cpu import image_loss_cpu
+    if backend == "reference" or rendered.is_meta:
+        with without_autocast(rendered):
+            return image_loss_reference(rendered, target, ssim_weight)
+    kernels = load_kernels("image_loss", backend)
+    keep = torch.is_grad_enabled() and rendered.requires_grad
+    return _ImageLoss.apply(kernels, rendered.contiguous(), target.contiguous(), ssim_weight, keep)
 
-        return image_loss_cpu(rendered, target, ssim_weight)
-    with without_autocast(rendered):
-        return image_loss_reference(rendered, target, ssim_weight)
+
+class _ImageLoss(torch.autograd.Function):
+    """The loss as a function of torch, which saves only its gradient for the backward pass."""
+
+    @staticmethod
+    def forward(ctx, kernels: ModuleType, rendered, target, ssim_weight, keep):
+        weights = loss_weights(*rendered.shape[-2:], ssim_weight)
+        loss, gradient = kernels.compare_images(rendered, target, weights, keep)
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_output):
+        (gradient,) = ctx.saved_tensors
+        return None, grad_output[..., None, None, None] * gradient, None, None, None
 
 
 def _check(rendered: Tensor, target: Tensor, ssim_weight: float, masks: Tensor | None) -> None:

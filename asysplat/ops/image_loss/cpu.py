@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from asysplat.kernels.simd.threads import even_bounds, inline, kernel, run_blocks
 from asysplat.kernels.simd.vectors import (
@@ -73,44 +72,31 @@ class Factors(NamedTuple):
     c: np.ndarray
 
 
-def image_loss_cpu(
+def compare_images(
     rendered: Float[Tensor, "*batch 3 H W"],
     target: Float[Tensor, "*batch 3 H W"],
-    ssim_weight: float,
-) -> Float[Tensor, "*batch"]:
-    """Compute the loss in float32; see `asysplat.ops.image_loss`."""
-    keep = torch.is_grad_enabled() and rendered.requires_grad
-    return _ImageLoss.apply(rendered.contiguous(), target.contiguous(), ssim_weight, keep)
+    weights: tuple[float, float],
+    keep: bool,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3 H W"] | None]:
+    """Compute the loss in float32 and, if `keep`, its gradient; see `asysplat.ops.image_loss`.
 
-
-class _ImageLoss(torch.autograd.Function):
-    """The loss as a function of torch, which saves only its gradient for the backward pass."""
-
-    @staticmethod
-    def forward(ctx, rendered, target, ssim_weight, keep):
-        H, W = rendered.shape[-2:]
-        per_pixel = (1 - ssim_weight) / (3 * H * W)
-        per_window = ssim_weight / (3 * (H - REACH) * (W - REACH)) if ssim_weight else 0.0
-        images = ImagePair(*(tensor.view(-1, H, W).numpy() for tensor in (rendered, target)))
-        gradient = torch.empty_like(rendered) if keep else None
-        sums = torch.empty(len(images.target) * -(-H // BAND), 2, dtype=torch.float64)
-        run_blocks(
-            compare_bands,
-            even_bounds(len(sums)),
-            images,
-            Weights(np.float32(per_pixel), np.float32(per_window)),
-            sums.numpy(),
-            gradient.view(-1, H, W).numpy() if keep else None,
-        )
-        ctx.save_for_backward(gradient)
-        error, dissimilarity = sums.view(*rendered.shape[:-3], -1, 2).sum(-2).unbind(-1)
-        return (per_pixel * error + per_window * dissimilarity).float()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_output):
-        (gradient,) = ctx.saved_tensors
-        return grad_output[..., None, None, None] * gradient, None, None, None
+    For `weights`, see `reference.loss_weights`.
+    """
+    *batch, _, H, W = rendered.shape
+    per_pixel, per_window = weights
+    images = ImagePair(*(tensor.view(-1, H, W).numpy() for tensor in (rendered, target)))
+    gradient = torch.empty_like(rendered) if keep else None
+    sums = torch.empty(len(images.target) * -(-H // BAND), 2, dtype=torch.float64)
+    run_blocks(
+        compare_bands,
+        even_bounds(len(sums)),
+        images,
+        Weights(np.float32(per_pixel), np.float32(per_window)),
+        sums.numpy(),
+        None if gradient is None else gradient.view(-1, H, W).numpy(),
+    )
+    error, dissimilarity = sums.view(*batch, -1, 2).sum(-2).unbind(-1)
+    return (per_pixel * error + per_window * dissimilarity).float(), gradient
 
 
 @kernel

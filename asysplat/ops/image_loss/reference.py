@@ -18,6 +18,13 @@ def window_weights() -> Float[Tensor, "11"]:
     return weights / weights.sum()
 
 
+def loss_weights(height: int, width: int, ssim_weight: float) -> tuple[float, float]:
+    """Return the weights in an image's loss of each pixel's |d| and of each window's 1 - SSIM."""
+    windows = (height - SIZE + 1) * (width - SIZE + 1)
+    per_window = ssim_weight / (3 * windows) if ssim_weight else 0.0
+    return (1 - ssim_weight) / (3 * height * width), per_window
+
+
 def image_loss_reference(
     rendered: Float[Tensor, "*batch 3 H W"],
     target: Float[Tensor, "*batch 3 H W"],
