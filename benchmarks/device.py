@@ -36,6 +36,7 @@ from benchmarks.libraries import LIBRARIES
 from benchmarks.ops import (
     ATTENTION,
     BACKENDS,
+    CONVOLUTION,
     PLANE_SWEEP,
     REFERENCE,
     SCANS,
@@ -70,6 +71,7 @@ SIZES: dict[str, dict[str, Sizes]] = {  # of the operators that each type of dev
         "render_1M": {"gaussians": 1_000_000, "height": 1080, "width": 1920},
         "ssd": {"batch": 1, "length": 8192, "heads": 28, "head_dim": 64, "state": 256},
         "selective_scan": {"batch": 32, "length": 1024, "channels": 128, "state": 16},
+        "conv_silu": {"batch": 1, "length": 8192, "channels": 2304, "size": 4, "before": 3},
         "plane_sweep": {"batch": 1, "views": 16, "height": 128, "width": 128}
         | {"planes": 48, "neighbors": 4},
         "grid_attention": {"batch": 1, "views": 16, "height": 16, "width": 16}
@@ -81,6 +83,7 @@ SIZES: dict[str, dict[str, Sizes]] = {  # of the operators that each type of dev
         "render": {"gaussians": 10_000, "height": 128, "width": 128},
         "ssd": {"batch": 1, "length": 1024, "heads": 4, "head_dim": 64, "state": 64},
         "selective_scan": {"batch": 4, "length": 256, "channels": 64, "state": 16},
+        "conv_silu": {"batch": 1, "length": 1024, "channels": 320, "size": 4, "before": 3},
         "plane_sweep": {"batch": 1, "views": 4, "height": 64, "width": 64}
         | {"planes": 48, "neighbors": 3},
         "grid_attention": {"batch": 1, "views": 4, "height": 16, "width": 16}
@@ -205,7 +208,7 @@ CASES: dict[str, Callable[[Sizes, torch.device], Case]] = {
     "render_1M": partial(_render_case, torch_too=False),
     **{
         operator: partial(_operator_case, operator=operator)
-        for operator in (*SCANS, PLANE_SWEEP, ATTENTION)
+        for operator in (*SCANS, CONVOLUTION, PLANE_SWEEP, ATTENTION)
     },
     "adam": _adam_case,
     "image_loss": _image_loss_case,

@@ -45,8 +45,8 @@ error: relative L2 error against the reference in float64; *: measured on smalle
 
 STEPS = (1e-3, 1e-1)  # range of dt in an untrained network
 SCANS = ("ssd", "selective_scan")
-ATTENTION, PLANE_SWEEP = "grid_attention", "plane_sweep"
-FP32_INPUTS = ("dt", "A", "D")  # inputs of a scan that stay fp32
+ATTENTION, PLANE_SWEEP, CONVOLUTION = "grid_attention", "plane_sweep", "conv_silu"
+FP32_INPUTS = ("dt", "A", "D", "weight", "bias")  # inputs that stay fp32
 # The shape of each input, in the order in which they are drawn.
 SHAPES = {
     # The scan of a Mamba2 layer, in one direction
@@ -57,11 +57,14 @@ SHAPES = {
     | {**dict.fromkeys("BC", "batch length state"), "D": "channels"},
     # One attention layer; grid 1 is full attention
     ATTENTION: dict.fromkeys("qkv", "batch views height width heads head_dim"),
+    # The convolution of a Mamba2 layer, in one direction
+    CONVOLUTION: {"tokens": "batch length channels", "weight": "channels size", "bias": "channels"},
 }
 # The backend measured beside "cpu" or "cuda", and the sizes that are arguments of the operator.
 BACKENDS = dict.fromkeys(SCANS, "chunked") | {ATTENTION: "sdpa", PLANE_SWEEP: REFERENCE}
+BACKENDS[CONVOLUTION] = REFERENCE
 ARGUMENTS = dict.fromkeys(SCANS, ()) | {ATTENTION: ("grid",)}
-ARGUMENTS[PLANE_SWEEP] = ("planes", "neighbors")
+ARGUMENTS |= {PLANE_SWEEP: ("planes", "neighbors"), CONVOLUTION: ("before",)}
 # The scene of the plane sweep: cameras on an arc in front of a slanted, textured wall.
 SLANT = 0.3  # increase of the wall's depth with each unit to the right
 WAVES = 20  # sine waves in each color channel of the texture

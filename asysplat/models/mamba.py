@@ -6,12 +6,10 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
-from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.attention import MLP
 from asysplat.models.layers import RMSNorm, StageShape
-from asysplat.ops import selective_scan, ssd
+from asysplat.ops import conv_silu, selective_scan, ssd
 
 MAMBA2_KERNEL, VISION_KERNEL = 4, 3  # tokens of a convolution
 EXPAND = 2  # of Mamba2: inner width over width
@@ -57,10 +55,10 @@ class Mamba2Direction(nn.Module):
     def forward(self, u: Float[Tensor, "B L u"]) -> Float[Tensor, "B L inner"]:
         z, xBC, dt = u.split(self.splits, dim=-1)
         # Each token with the MAMBA2_KERNEL - 1 tokens before it in scan order.
-        weight, before = self.conv.weight, MAMBA2_KERNEL - 1
+        weight, before = self.conv.weight[:, 0], MAMBA2_KERNEL - 1
         if self.reverse:
             weight, before = weight.flip(-1), 0
-        xBC = F.silu(depthwise_conv(xBC, weight, self.conv.bias, before))
+        xBC = conv_silu(xBC, weight, self.conv.bias, before)
         x, B, C = xBC.split((self.splits[0], self.state_size, self.state_size), dim=-1)
         dt = F.softplus(dt.float() + self.dt_bias)
         heads = x.unflatten(-1, (self.splits[2], -1))
@@ -115,56 +113,9 @@ class MambaVisionMixer(nn.Module):
 
     def forward(self, sequences: Float[Tensor, "F L d"]) -> Float[Tensor, "F L d"]:
         x, gate = self.project(sequences).chunk(2, dim=-1)
-        x = F.silu(depthwise_conv(x, self.conv_scan.weight, None, before=VISION_KERNEL // 2))
-        gate = F.silu(depthwise_conv(gate, self.conv_gate.weight, None, before=VISION_KERNEL // 2))
+        x = conv_silu(x, self.conv_scan.weight[:, 0], None, before=VISION_KERNEL // 2)
+        gate = conv_silu(gate, self.conv_gate.weight[:, 0], None, before=VISION_KERNEL // 2)
         dt, B, C = self.x_proj(x).split(self.splits, dim=-1)
         dt = F.softplus(self.dt_proj(dt).float())
         y = selective_scan(x, dt, -self.A_log.exp(), B, C, self.D)
         return self.out(torch.cat((y, gate), dim=-1))
-
-
-def depthwise_conv(
-    tokens: Float[Tensor, "B L C"],
-    weight: Float[Tensor, "C 1 K"],
-    bias: Float[Tensor, " C"] | None,
-    before: int,
-) -> Float[Tensor, "B L C"]:
-    """Convolve each token with `before` tokens before it and K - 1 - before tokens after it."""
-    with without_autocast(tokens):
-        bias = None if bias is None else bias.to(tokens.dtype)
-        return _DepthwiseConv.apply(tokens, weight.to(tokens.dtype), bias, before)
-
-
-class _DepthwiseConv(torch.autograd.Function):
-    """With its own backward pass: torch computes the weights' gradient slowly on a CPU."""
-
-    @staticmethod
-    def forward(ctx, tokens, weight, bias, before):
-        ctx.save_for_backward(tokens, weight)
-        ctx.before, ctx.has_bias = before, bias is not None
-        return _convolve(tokens, weight, bias, before)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_output):
-        tokens, weight = ctx.saved_tensors
-        length, size, before = tokens.shape[1], weight.shape[-1], ctx.before
-        with without_autocast(tokens):
-            grad_tokens = _convolve(grad_output, weight.flip(-1), None, size - 1 - before)
-        padded = _pad(tokens, size, before)
-        grad_output = grad_output.to(torch.promote_types(grad_output.dtype, torch.float32))
-        taps = [(padded[:, k : k + length] * grad_output).sum((0, 1)) for k in range(size)]
-        grad_weight = torch.stack(taps, -1)[:, None].to(weight.dtype)
-        grad_bias = grad_output.sum((0, 1)).to(weight.dtype) if ctx.has_bias else None
-        return grad_tokens, grad_weight, grad_bias, None
-
-
-def _convolve(tokens: Tensor, weight: Tensor, bias: Tensor | None, before: int) -> Tensor:
-    # As an image one pixel high, whose channels may be innermost in memory: torch would copy those
-    # of a sequence.
-    image = _pad(tokens, weight.shape[-1], before).mT.unsqueeze(-2)
-    return F.conv2d(image, weight.unsqueeze(-2), bias, groups=len(weight)).squeeze(-2).mT
-
-
-def _pad(tokens: Tensor, size: int, before: int) -> Tensor:
-    return F.pad(tokens, (0, 0, before, size - 1 - before))

@@ -6,9 +6,10 @@ of them. The scans' `reference.py` also has a fast implementation in torch. Thei
 `kernels.py`, and the `__init__.py` beside it runs both passes.
 """
 
+from asysplat.ops.conv_silu import conv_silu
 from asysplat.ops.grid_attention import grid_attention
 from asysplat.ops.image_loss import image_loss
 from asysplat.ops.selective_scan import selective_scan
 from asysplat.ops.ssd import ssd
 
-__all__ = ["grid_attention", "image_loss", "selective_scan", "ssd"]
+__all__ = ["conv_silu", "grid_attention", "image_loss", "selective_scan", "ssd"]

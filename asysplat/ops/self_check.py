@@ -30,6 +30,15 @@ def selective_scan(device: torch.device, backend: str) -> dict[str, float]:
     return _compare(ops.selective_scan, sample, device, (backend, "chunked"))
 
 
+def conv_silu(device: torch.device, backend: str) -> dict[str, float]:
+    """Compare the output and all gradients, with channels that are no multiple of a block's."""
+
+    def sample(draw: Sample) -> list[Tensor]:
+        return [draw(2, TOKENS, 150), draw(150, 4), draw(150)]
+
+    return _compare(partial(ops.conv_silu, before=2), sample, device, (backend, "reference"))
+
+
 def grid_attention(device: torch.device, backend: str) -> dict[str, float]:
     """Compare the output and all gradients, with sides that are no multiple of the grid's."""
 

@@ -11,6 +11,7 @@ from triton.runtime.jit import JITFunction
 
 from asysplat.ops.adam.cuda import adam_step_cuda
 from asysplat.ops.adam.reference import AdamSettings, Rows
+from asysplat.ops.conv_silu import cuda as conv_silu
 from asysplat.ops.image_loss import cuda as image_loss
 from asysplat.ops.image_loss.reference import loss_weights
 from asysplat.ops.plane_sweep import cuda as plane_sweep
@@ -116,6 +117,16 @@ def _scan(
     module.backward(y, inputs, saved, reverse)
 
 
+def _convolve(
+    width: int, channels: int, size: int, dtype: torch.dtype, before: int, biased: bool
+) -> None:
+    """Convolve a slice of the channels of tokens with `width` channels."""
+    tokens = torch.zeros(1, 1024, width, dtype=dtype)[..., :channels]
+    weight, bias = torch.zeros(channels, size), torch.zeros(channels) if biased else None
+    y = conv_silu.forward(tokens, weight, bias, before)
+    conv_silu.backward(y, tokens, weight, bias, before)
+
+
 def _plane_sweep(planes: int) -> None:
     views, neighbors = 2, torch.zeros(1, 2, 4, dtype=torch.int64)
     images, motions = torch.zeros(1, views, 256, 256), torch.zeros(1, views, 4, 3, 4)
@@ -155,6 +166,9 @@ CASES: dict[str, Callable[[], None]] = {
     "ssd, paper, fp32": lambda: _scan(ssd, (28, 64), 256, torch.float32, True),
     "ssd, paper, bf16": lambda: _scan(ssd, (28, 64), 256, torch.bfloat16),
     "ssd, paper, fp16": lambda: _scan(ssd, (28, 64), 256, torch.float16),
+    "convolution, Mamba2, fp32": lambda: _convolve(4124, 2304, 4, torch.float32, 3, True),
+    "convolution, Mamba2, bf16": lambda: _convolve(4124, 2304, 4, torch.bfloat16, 0, True),
+    "convolution, MambaVision, bf16": lambda: _convolve(896, 448, 3, torch.bfloat16, 1, False),
     "adam": _adam,
     "image loss, L1 and SSIM": lambda: _image_loss(0.2),
     "image loss, L1": lambda: _image_loss(0.0),

@@ -17,6 +17,7 @@ TINY = {
     "render_1M": {"gaussians": 70, "height": 20, "width": 24},
     "ssd": {"batch": 1, "length": 20, "heads": 2, "head_dim": 16, "state": 16},
     "selective_scan": {"batch": 2, "length": 20, "channels": 16, "state": 16},
+    "conv_silu": {"batch": 2, "length": 20, "channels": 18, "size": 4, "before": 3},
     "plane_sweep": {"batch": 1, "views": 3, "height": 16, "width": 20, "planes": 8, "neighbors": 2},
     "grid_attention": {"batch": 1, "views": 2, "height": 4, "width": 6}
     | {"heads": 2, "head_dim": 8, "grid": 2},

@@ -34,6 +34,7 @@ KERNELS = {
     "selective_scan": {"sum_chunk", "backward_chunk", *SCANS},
     "ssd": {"sum_decays", "score_chunk", "head_gradients", "score_gradients"}
     | {"projection_gradients", *SCANS},
+    "conv_silu": {"forward_band", "backward_band"},
     "adam": {"drop_not_finite", "update_rows"},
     "image_loss": {"compare_windows", "compare_pixels"},
 }

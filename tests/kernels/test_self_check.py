@@ -13,7 +13,7 @@ from asysplat.kernels.dispatch import choose_fastest
 from asysplat.kernels.self_check import TOLERANCE, find_fault
 
 GPU = torch.device("cuda", 0)
-OPERATORS = ("adam", "ssd", "selective_scan", "plane_sweep", "image_loss")
+OPERATORS = ("adam", "conv_silu", "ssd", "selective_scan", "plane_sweep", "image_loss")
 CHECKS = [f"asysplat.ops.self_check:{name}" for name in OPERATORS]
 CHECKS += ["asysplat.rendering.self_check:render"]
 

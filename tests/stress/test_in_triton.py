@@ -11,9 +11,9 @@ import sys
 import pytest
 from backends import INTERPRETED
 
-# Small cases of each kernel: the renderer's, and those of scans, plane sweep and image loss.
+# Small cases of each kernel: the renderer's, and those of the operators.
 KERNELS = ("rendering/test_cuda.py", "ops/test_cuda_scans.py", "ops/test_plane_sweep.py")
-KERNELS = (*KERNELS, "ops/test_image_loss.py")
+KERNELS = (*KERNELS, "ops/test_image_loss.py", "ops/test_cuda_conv_silu.py")
 LARGE = "blobs or wide or mixed"
 # The cases of each file here, as an expression of pytest's -k.
 STRESS = {
