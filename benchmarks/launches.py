@@ -31,6 +31,7 @@ from asysplat.scene import Cameras, Gaussians, Views
 from benchmarks.compare import Kind, TrackedMetrics
 from benchmarks.table import make_table, number_column, text_column
 from benchmarks.timing import Result
+from benchmarks.traffic import FREE, measure_blocks
 
 TRACKED = TrackedMetrics(
     names=("case",), must_match=(), kinds={"launches": Kind("launches", "slower", "faster", 0.0)}
@@ -41,16 +42,14 @@ kernels: ours; waits: where the host reads from the device, or copies numbers to
 MEMORY_NOTES = """\
 MB of tensors besides the Gaussians, without what a sort allocates for itself; each Gaussian \
 touches five tiles; kept: between both passes; peak: with the gradients of image and Gaussians"""
+BLOCK_NOTES = """\
+kB: what the operators of a forward pass in bf16 read and write for each token of the output, at \
+the paper's widths; attention and a scan are one operator each"""
 SCENES = {  # Gaussians, SH degree, height and width
     "100,000 Gaussians, 540x960": (100_000, 0, 540, 960),
     "1 million, 1080x1920": (1_000_000, 0, 1080, 1920),
     "5 million, 1080x1920, SH degree 3": (5_000_000, 3, 1080, 1920),
 }
-# Operators that launch nothing.
-FREE = {"view", "_unsafe_view", "expand", "permute", "transpose", "t", "slice", "select", "unbind"}
-FREE |= {"unsqueeze", "squeeze", "detach", "alias", "as_strided", "split", "split_with_sizes"}
-FREE |= {"diagonal", "unfold", "_reshape_alias", "is_same_size", "unflatten", "promote_types"}
-FREE |= {"empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided"}
 # Results whose values or sizes the host needs.
 READ = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal"}
 BY_MASK = {"index", "index_put_", "_index_put_impl_"}  # if an index is boolean
@@ -168,12 +167,14 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": for each case the numbers of operators, kernels, both together, and waits.
         "memory": for each of SCENES the bytes kept between both passes of a rendering, and most.
+        "blocks": for each block of the paper's network its operators, and their bytes of a token.
     """
     if not find_spec("triton"):
         raise InputError("suite=launches needs Triton, which comes with torch on Linux.")
     with as_on_a_gpu() as recorder:
         rows = [row for case in CASES for row in case(recorder)]
-        return {"rows": rows, "memory": [_memory(recorder, name) for name in SCENES]}
+        memory = [_memory(recorder, name) for name in SCENES]
+    return {"rows": rows, "memory": memory, "blocks": measure_blocks()}
 
 
 def make_views(count: int, height: int = 64, width: int = 96) -> Views:
@@ -242,6 +243,7 @@ def tables(results: Result) -> list[Table]:
     return [
         make_table("Launches on a GPU", COLUMNS, results["rows"], NOTES),
         make_table("Memory of both passes", MEMORY_COLUMNS, results["memory"], MEMORY_NOTES),
+        make_table("Blocks of the network", BLOCK_COLUMNS, results["blocks"], BLOCK_NOTES),
     ]
 
 
@@ -256,4 +258,9 @@ MEMORY_COLUMNS = {
     "": text_column("{scene}"),
     "kept": number_column("kept", "{:,.0f}", unit=1e6),
     "peak": number_column("peak", "{:,.0f}", unit=1e6),
+}
+BLOCK_COLUMNS = {
+    "": text_column("{block}"),
+    "operators": number_column("operators", "{:,.0f}"),
+    "kB": number_column("bytes", "{:,.1f}", unit=1e3),
 }

@@ -5,6 +5,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -56,7 +57,7 @@ class Widths:
 
 
 class RMSNorm(nn.RMSNorm):
-    """RMSNorm computed in the type of its weights, fp32, and returned in the input's.
+    """RMSNorm in the input's type, to which the weights are rounded; sums are in fp32.
 
     If weights and inputs differ in type, torch does not use its fused kernel.
     """
@@ -66,7 +67,7 @@ class RMSNorm(nn.RMSNorm):
 
     def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         with without_autocast(x):
-            return super().forward(x.to(self.weight.dtype)).to(x.dtype)
+            return F.rms_norm(x, self.normalized_shape, self.weight.to(x.dtype), self.eps)
 
 
 PIXEL_CHANNELS = 9

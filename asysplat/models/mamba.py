@@ -34,8 +34,8 @@ class BiMamba2(nn.Module):
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
         u = self.project(self.norm(tokens)).flatten(1, 3)
-        mixed = sum(direction(u) for direction in self.directions)
-        return tokens + self.out(mixed).view_as(tokens)
+        forward, backward = (direction(u) for direction in self.directions)
+        return tokens + self.out(forward + backward).view_as(tokens)
 
 
 class Mamba2Direction(nn.Module):

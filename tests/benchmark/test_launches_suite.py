@@ -19,6 +19,13 @@ MOST = {  # launches and waits
     "step of a refinement": (53, 1),
     "with known depths": (95, 1),
 }
+MOST_KILOBYTES = {  # of a token
+    "m, Mamba2 both ways": 158,
+    "s, sparse attention": 158,
+    "MambaVision": 30,
+    "fine to coarse": 115,
+    "coarse to fine": 59,
+}
 MOST_MEGABYTES = {"100,000 Gaussians, 540x960": 53, "1 million, 1080x1920": 315}
 
 
@@ -32,8 +39,10 @@ def test_no_more_launches_waits_and_memory_than_today(make_options, monkeypatch)
         assert found[case][0] <= most and found[case][1] <= waits, case
     for row, most in zip(results["memory"], MOST_MEGABYTES.values(), strict=True):
         assert 0 < row["kept"] < row["peak"] <= most * 1e6
-    counts, memory = launches.tables(results)
-    assert (counts.row_count, memory.row_count) == (len(MOST), len(MOST_MEGABYTES))
+    for row, (block, most) in zip(results["blocks"], MOST_KILOBYTES.items(), strict=True):
+        assert row["block"] == block and 0 < row["bytes"] <= most * 1e3
+    rows = [table.row_count for table in launches.tables(results)]
+    assert rows == [len(MOST), len(MOST_MEGABYTES), len(MOST_KILOBYTES)]
 
 
 def test_statistics_wait_when_they_are_read():
