@@ -15,9 +15,9 @@ from benchmarks import launches
 MOST = {  # launches and waits
     "render": (13, 1),  # the number of pairs, when a GPU has been given all its work
     "render, with a graph": (13, 1),
-    "its gradient": (5, 0),
-    "step of a refinement": (53, 1),
-    "with known depths": (95, 1),
+    "its gradient": (4, 0),
+    "step of a refinement": (52, 1),
+    "with known depths": (94, 1),
 }
 MOST_KILOBYTES = {  # of a token
     "m, Mamba2 both ways": 158,

@@ -50,7 +50,7 @@ def test_every_launch_compiles_and_fits(capability):
     launches = without_repeats(record_launches(capability), capability)
     names = {f"{package}.{name}" for package, names in KERNELS.items() for name in names}
     assert {launch.name for launch in launches} == names
-    assert len(launches) < 90  # variants of kernels
+    assert len(launches) < 100  # variants of kernels
     for launch in launches:
         usage = measure_usage(compile_launch(launch, capability), capability)
         name = f"{launch.name} of {launch.case}"

@@ -455,7 +455,9 @@ def _project_backward(
     """Compute the gradients of the inputs from those of the splats; None where not required."""
     blocks, device = -(-frame.num // BACKWARD_BLOCK), counts.device
     shape = (frame.images, blocks, formulas.CAMERA_GRADIENT)
-    sh = torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None
+    one_view, sh = frame.views == 1, None
+    if needs["SH_NEEDED"]:
+        sh = torch.empty_like(inputs.sh) if one_view else torch.zeros_like(inputs.sh)
     cameras = None
     if needs["CAMERAS_NEEDED"]:
         cameras = torch.zeros(shape, dtype=torch.float64, device=device)
@@ -473,6 +475,7 @@ def _project_backward(
             ANTIALIASED=settings.antialiased,
             HAS_DEPTH=settings.depth is not None,
             **needs,
+            ONE_VIEW=one_view,
             COUNT=frame.sh_count,
             BLOCK=BACKWARD_BLOCK,
             num_warps=BACKWARD_BLOCK // 32,

@@ -106,7 +106,7 @@ def project_backward(
     grad_quats,
     grad_scales,
     grad_opacities,
-    grad_sh,  # zeros to add to; None without SH_NEEDED
+    grad_sh,  # zeros to add to, anything with ONE_VIEW; None without SH_NEEDED
     grad_cameras,  # [B * views, programs of a scene, 16] zeros; None without CAMERAS_NEEDED
     num,
     views,
@@ -116,6 +116,7 @@ def project_backward(
     HAS_DEPTH: tl.constexpr,
     SH_NEEDED: tl.constexpr,
     CAMERAS_NEEDED: tl.constexpr,
+    ONE_VIEW: tl.constexpr,
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -135,6 +136,7 @@ def project_backward(
             camera = cameras + CAMERA * image
             opacity_part, mean_part, quat_part, scale_part = splat_backward(
                 g,
+                valid,
                 drawn,
                 inputs=(means, quats, scales, opacities, sh),
                 camera=camera,
@@ -147,6 +149,7 @@ def project_backward(
                 ANTIALIASED=ANTIALIASED,
                 SH_NEEDED=SH_NEEDED,
                 CAMERAS_NEEDED=CAMERAS_NEEDED,
+                ONE_VIEW=ONE_VIEW,
                 COUNT=COUNT,
             )
             g_opacity += tl.where(drawn, opacity_part, 0.0)
@@ -155,6 +158,9 @@ def project_backward(
             g_quat = plus(g_quat, 1.0, keep_where(drawn, quat_part)) + (
                 g_quat[3] + tl.where(drawn, quat_part[3], 0.0),
             )
+        elif SH_NEEDED and ONE_VIEW:
+            for k in tl.static_range(3 * COUNT):
+                tl.store(grad_sh + 3 * COUNT * g + k, zero, mask=valid)
     store3(grad_means, g, g_mean, valid)
     store3(grad_scales, g, g_scale, valid)
     for k in tl.static_range(4):
@@ -212,6 +218,7 @@ def store_sum3(grad_cameras, camera_offset, values, drawn):
 @kernel
 def splat_backward(
     g,
+    valid,
     drawn,
     inputs,
     camera,
@@ -224,6 +231,7 @@ def splat_backward(
     ANTIALIASED: tl.constexpr,
     SH_NEEDED: tl.constexpr,
     CAMERAS_NEEDED: tl.constexpr,
+    ONE_VIEW: tl.constexpr,
     COUNT: tl.constexpr,
 ):
     """Compute the gradients of opacity, mean, quaternion and scale from the splats of one image.
@@ -281,9 +289,9 @@ def splat_backward(
     if SH_NEEDED:
         for k in tl.static_range(COUNT):
             coefficients = grad_sh + 3 * (COUNT * g + k)
-            accumulate(coefficients, basis[k] * g_red, drawn)
-            accumulate(coefficients + 1, basis[k] * g_green, drawn)
-            accumulate(coefficients + 2, basis[k] * g_blue, drawn)
+            accumulate(coefficients, basis[k] * g_red, valid, drawn, ONE_VIEW)
+            accumulate(coefficients + 1, basis[k] * g_green, valid, drawn, ONE_VIEW)
+            accumulate(coefficients + 2, basis[k] * g_blue, valid, drawn, ONE_VIEW)
     if COUNT > 1:
         g_basis = (tl.zeros_like(g_red),)
         for k in tl.static_range(1, COUNT):
@@ -316,6 +324,9 @@ def unclamped_gradient(color, grad):
 
 
 @kernel
-def accumulate(pointers, values, valid):
-    """Add `values` to the numbers at `pointers`."""
-    tl.store(pointers, tl.load(pointers, mask=valid, other=0.0) + values, mask=valid)
+def accumulate(pointers, values, valid, drawn, ONE_VIEW: tl.constexpr):
+    """Add `values` where `drawn` to the numbers at `pointers`; of one view, write them."""
+    if ONE_VIEW:
+        tl.store(pointers, tl.where(drawn, values, 0.0), mask=valid)
+    else:
+        tl.store(pointers, tl.load(pointers, mask=drawn, other=0.0) + values, mask=drawn)
