@@ -1,14 +1,18 @@
 """Choose the folder of a run and lock it."""
 
 import fcntl
+import os
 import re
 import shutil
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
+from lightning.fabric.plugins.environments import SLURMEnvironment
 from lightning.pytorch.utilities import rank_zero_only
+from torch.distributed import TCPStore
 
 from asysplat.errors import InputError
 from asysplat.files import make_folder, refuse_links
@@ -24,7 +28,28 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     """Choose the folder of a run, for `hydra.run.dir` of conf/train.yaml.
 
     An interrupted run resumes in its own folder; others get `new`. `runs` has all of one name.
+    Processes that a launcher has started, each at its own second, get one folder.
     """
+    environ = os.environ
+    if environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":  # torchrun
+        return _of_first_process(partial(_choose_folder, ckpt_path, runs, new))
+    if SLURMEnvironment.detect() and int(environ["SLURM_NTASKS"]) > 1:
+        step = environ.get("SLURM_STEP_ID", "0")
+        new = str(Path(new).with_name(f"slurm_{environ['SLURM_JOB_ID']}_{step}"))
+    return _choose_folder(ckpt_path, runs, new)
+
+
+def _of_first_process(choose: Callable[[], str]) -> str:
+    """Return what the process of rank 0 chooses, by the store in which torchrun's agents meet."""
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    store = TCPStore(host, port, is_master=False)
+    key = f"asysplat/run_folder/{os.environ['TORCHELASTIC_RESTART_COUNT']}"
+    if os.environ["RANK"] == "0":
+        store.set(key, choose())
+    return store.get(key).decode()
+
+
+def _choose_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     if ckpt_path == "last":
         try:
             folder = newest_folder(Path(runs))

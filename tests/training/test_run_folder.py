@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from torch.distributed import TCPStore
 
 from asysplat.errors import InputError
 from asysplat.training.run_folder import job_name, locked, run_folder
@@ -92,3 +93,29 @@ def test_no_two_train_in_one_folder_until_one_is_killed(tmp_path):
     with locked(folder):
         assert folder.is_dir()
     os.kill(loader, signal.SIGKILL)
+
+
+def test_processes_of_torchrun_get_the_folder_of_the_first(monkeypatch, tmp_path):
+    """Its agents hold a store; a restart chooses again."""
+    store = TCPStore("localhost", 0, is_master=True)
+    launched = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_RESTART_COUNT": "0"}
+    launched |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(store.port)}
+
+    def choose(rank, new, **others):
+        for name, value in (launched | {"RANK": rank} | others).items():
+            monkeypatch.setenv(name, value)
+        return run_folder(None, str(tmp_path), new)
+
+    assert [choose("0", "noon"), choose("1", "a second later")] == ["noon", "noon"]
+    again = {"TORCHELASTIC_RESTART_COUNT": "1"}
+    assert [choose("0", "one", **again), choose("1", "two", **again)] == ["one", "one"]
+
+
+def test_processes_of_slurm_get_the_folder_of_their_job(monkeypatch, tmp_path):
+    for name, value in {"SLURM_JOB_ID": "17", "SLURM_STEP_ID": "3", "SLURM_NTASKS": "8"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("SLURM_JOB_NAME", "train")
+    expected = str(tmp_path / "slurm_17_3")
+    assert {run_folder(None, "", str(tmp_path / new)) for new in ("noon", "later")} == {expected}
+    monkeypatch.setenv("SLURM_NTASKS", "1")
+    assert run_folder(None, "", str(tmp_path / "noon")) == str(tmp_path / "noon")
