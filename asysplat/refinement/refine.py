@@ -264,10 +264,11 @@ def refine(
     """
     budget = read_budget(seconds, steps)
     refinement = Refinement(gaussians, views, background, settings, seed)
-    if seconds is not None:  # a step with few Gaussians compiles the kernels before the time runs
+    if seconds is not None:  # steps with few Gaussians compile the kernels before the time runs
         few, one_view = gaussians.map(lambda field: field[:10]), replace(settings, views_per_step=1)
         small = Refinement(few, views.select([0]), settings=one_view)
         small.step(0.0)
+        small.step(1.0)
         small.densify(0.0)
     run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
     refined = refinement.gaussians

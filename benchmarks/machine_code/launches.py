@@ -88,8 +88,14 @@ def keep_one_pair(arguments: dict[str, Any]) -> None:
             value.fill_(0)
 
 
-def _render(degree: int, views: int, cameras_needed: bool, masked: bool = False, **options) -> None:
-    num = 2048
+def _render(
+    degree: int,
+    views: int,
+    cameras_needed: bool,
+    masked: bool = False,
+    num: int = 2048,
+    **options,
+) -> None:
     gaussians = Gaussians(
         means=torch.zeros(1, num, 3, requires_grad=True),
         quats=torch.ones(1, num, 4),

@@ -24,7 +24,7 @@ from benchmarks.machine_code.cubin import (
     without_repeats,
 )
 from benchmarks.machine_code.estimate import CARDS, estimate
-from benchmarks.machine_code.launches import record_launches
+from benchmarks.machine_code.launches import _render, keep_one_pair, record_launches, recording
 
 SCANS = ("pass_states", "forward_chunk")
 KERNELS = {
@@ -78,6 +78,16 @@ def test_a_splat_is_few_instructions_of_memory_none_waiting_for_a_store(capabili
             accesses = re.findall(r"\b(ld|st)\.global", compiled.asm["ptx"])
             first = accesses.index("st")
             assert accesses[first : first + step] == ["st"] * step, launch.case
+
+
+def test_a_rendering_is_compiled_once_for_all_numbers_of_gaussians_and_views():
+    with recording() as (launches, fills):
+        fills[:] = [keep_one_pair]
+        for num, views in ((33, 3), (1, 1), (16, 2), (64, 4)):
+            _render(0, views, True, num=num)
+    found = Counter(launch.kernel_name for launch in without_repeats(launches, 90))
+    twice = {"list_tiles": 2, "project_backward": 2}  # counts and lists; one view and several
+    assert found == dict.fromkeys(KERNELS["rendering"], 1) | twice
 
 
 def test_no_lane_loads_a_step_of_adam_that_another_has_stored():

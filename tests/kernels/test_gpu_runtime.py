@@ -106,7 +106,7 @@ def test_kernels_run_on_a_device_that_is_not_the_current_one(make_scene, name):
 
 
 @two_devices
-@pytest.mark.parametrize("name", ["adam", "plane_sweep", "image_loss"])
+@pytest.mark.parametrize("name", ["adam", "plane_sweep", "image_loss", "conv_silu"])
 def test_references_agree_on_a_device_that_is_not_the_current_one(name):
     with torch.cuda.device(0):
         errors = getattr(self_check, name)(torch.device("cuda", 1), "cuda")

@@ -289,6 +289,19 @@ def test_pairs_beyond_the_room_are_drawn_again(make_scene, monkeypatch):
 
 
 @kernel
+def test_a_room_that_memory_does_not_hold_is_forgotten(make_scene, monkeypatch):
+    from asysplat.rendering.cuda import draw as module
+
+    monkeypatch.setattr(module, "_room", {})
+    scene, settings = make_batch(make_scene, count=3, device=DEVICE), RenderSettings()
+    image = draw_by_cuda(*scene, settings).image
+    module._room.update(dict.fromkeys(module._room, 2**45))
+    with pytest.raises(RuntimeError, match="memory"):
+        draw_by_cuda(*scene, settings)
+    assert draw_by_cuda(*scene, settings).image.equal(image)
+
+
+@kernel
 @pytest.mark.parametrize("parts", [3, 1000])
 def test_gradients_of_a_group_of_tiles_at_a_time(make_scene, monkeypatch, parts):
     """Several tiles, or one alone, as it has more pairs than a group should have."""

@@ -241,7 +241,8 @@ def _draw_pairs(
 ) -> tuple[TileLists, tuple[Tensor | None, ...], SavedForBackward]:
     """List the pairs and draw them; again, if they are more than there was room for."""
     similar = (pairs.splats.device, frame.images, frame.height, frame.width)
-    room, drawn = _room.get(similar) or pairs.number, False
+    # Taken out until it has been enough: another drawing starts anew if memory does not hold it.
+    room, drawn = _room.pop(similar, 0) or pairs.number, False
     while not drawn:
         lists = _list_pairs(frame, pairs, room, settings, keep, active)
         images, saved = _rasterize(frame, lists, settings)
@@ -265,9 +266,9 @@ def _list_pairs(
     key = next(t for t in (torch.int16, torch.int32, torch.int64) if tiles < torch.iinfo(t).max)
     tile_of = torch.full((room,), torch.iinfo(key).max, dtype=key, device=counts.device)
     owners, first_pair = counts.new_empty(room), torch.empty_like(counts)
-    places = {"tile_of": tile_of, "owners": owners, "first_pair": first_pair, "room": room}
+    lists = {"tile_of": tile_of, "owners": owners, "first_pair": first_pair, "room": room}
     visited = (pairs.splats, pairs.depths, pairs.order, counts)
-    _visit_tiles(frame, settings, *visited, ends=pairs.ends, **places)
+    _visit_tiles(frame, settings, *visited, ends=pairs.ends, **lists)
     tile_of, numbers = torch.sort(tile_of, stable=True)
     entries, places = torch.empty_like(owners), torch.empty_like(owners) if keep else None
     if room:
@@ -299,7 +300,7 @@ def _visit_tiles(
             counts=counts,
             box_tiles=box_tiles,
             **unused | pairs,
-            total=len(order),
+            num_splats=len(order),
             num=frame.num,
             **frame.grid,
             WRITE=bool(pairs),
@@ -437,7 +438,6 @@ def _rasterize_backward(
                 first_tile=first,
                 end_tile=end,
                 CHANNELS=channels,
-                ADD=first > 0,
                 BLOCK=SUM_BLOCK,
                 **PROJECT_OPTIONS,
             )

@@ -59,12 +59,11 @@ def sum_pairs(
     first_tile,
     end_tile,
     CHANNELS: tl.constexpr,
-    ADD: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Sum the gradients of each of BLOCK splats over tiles, in a fixed order; ADD to those before.
+    """Sum the gradients of each of BLOCK splats over tiles, in a fixed order.
 
-    The sum of a splat that is in no tile is not written.
+    The sum of the tiles before is added to, and that of a splat in no tile is not written.
     """
     d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + d, mask=d < num_splats, other=0)
@@ -73,9 +72,7 @@ def sum_pairs(
     column = tl.arange(0, COLUMNS)[None, :]
     row = sums + CHANNELS * d[:, None] + column
     drawn = (count > 0)[:, None] & (column < CHANNELS)
-    total = tl.zeros((BLOCK, COLUMNS), tl.float32)
-    if ADD:
-        total = tl.load(row, mask=drawn, other=0.0)
+    total = tl.load(row, mask=drawn & (first_tile > 0), other=0.0)
     error = tl.zeros((BLOCK, COLUMNS), tl.float32)
     for step in range(0, tl.max(count, 0), PAIRS):
         for k in tl.static_range(PAIRS):  # loads of 8 pairs are on their way at a time

@@ -21,14 +21,17 @@ MAX_OFFSET = tl.constexpr(2.0**30 - 128)  # pixels: twice as many fit int32
 
 
 class TileLists(NamedTuple):
-    """The splats of every tile, by depth; see `cpu.tiles.TileLists`."""
+    """The splats of every tile, by depth; see `cpu.tiles.TileLists`.
+
+    There may be more room than pairs; what is beyond them is arbitrary.
+    """
 
     splats: Tensor
     counts: Tensor  # [images * N] pairs of each splat
     first_pair: Tensor  # [images * N]
     first_entry: Tensor
-    entries: Tensor  # [pairs] splat of each pair, sorted by tile, then by depth
-    places: Tensor | None  # [pairs] where in `entries` each pair is; None without gradients
+    entries: Tensor  # [room] splat of each pair, sorted by tile, then by depth
+    places: Tensor | None  # [room] where in `entries` each pair is; None without gradients
     active: Tensor | None  # None if all tiles are
 
 
@@ -43,7 +46,7 @@ def list_tiles(
     tile_of,  # [room] tile of each pair
     owners,  # [room] splat of each pair
     first_pair,  # [images * N]
-    total,  # images * N
+    num_splats,  # images * N
     room,
     num,
     height,
@@ -56,7 +59,7 @@ def list_tiles(
 ):
     """Count the tiles of BLOCK splats, and of their boxes; with WRITE, list these pairs instead."""
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    exists = rank < total
+    exists = rank < num_splats
     d = tl.load(order + rank, mask=exists, other=0)
     valid = tl.load(depths + d, mask=exists, other=float("inf")) < float("inf")
     ellipse = load_ellipse(splats, d, valid)
