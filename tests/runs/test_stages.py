@@ -2,6 +2,11 @@
 
 import csv
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -197,3 +202,33 @@ def test_a_run_stopped_twice_in_its_second_stage_has_the_same_bits(train, whole,
     tests = {key for key in expected if "test/" in key}
     assert {f"{prefix}test/procedural/psnr" for prefix in PREFIXES} <= tests
     assert {key: results.get(key) for key in tests} == {key: expected[key] for key in tests}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_processes_of_torchrun_train_in_one_folder_and_resume_there(logs, repository):
+    """The second starts two seconds after the first; where one is killed, both go on later."""
+    options = [*TINY, f"paths.logs={logs}", "trainer=ddp", "trainer.accelerator=cpu"]
+    options += ["trainer.devices=2", "data.batch_size=2", "data.val_scenes=2", "data.test_scenes=2"]
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launcher += ["--nproc-per-node=2", "tests/late.py", "train.py", *options]
+    environ = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def launch(name, *more):
+        words = [*launcher, f"name={name}", *more]
+        return subprocess.Popen(words, cwd=repository, env=environ)
+
+    assert launch("launched").wait() == 0
+    process = launch("killed")
+    second = lambda: list((logs / "killed").glob("*/stage2/checkpoints/last.ckpt"))  # noqa: E731
+    while not second():
+        assert process.poll() is None
+        time.sleep(0.1)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(int(children[-1]), signal.SIGKILL)
+    assert process.wait() != 0
+    assert launch("killed", "ckpt_path=last").wait() == 0
+    (whole,), (resumed,) = ([*(logs / name).iterdir()] for name in ("launched", "killed"))
+    for name in ("stage1", "stage2", "."):
+        found, expected = (saved_in(at / name)["state_dict"] for at in (resumed, whole))
+        assert all(torch.equal(found[key], expected[key]) for key in expected)
