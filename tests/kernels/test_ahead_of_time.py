@@ -110,6 +110,14 @@ def test_no_lane_repeats_the_work_of_another():
         assert lanes == launch.arguments["BLOCK"], launch.case
 
 
+def test_ssd_stores_states_in_the_type_of_its_products_factors():
+    launches = [launch for launch in record_launches(90) if launch.name.startswith("ssd.")]
+    for launch in launches:
+        for name in {"states", "grad_states"} & launch.arguments.keys():
+            bits = 8 * launch.arguments[name].element_size()
+            assert bits == launch.arguments["DOT"].primitive_bitwidth, (launch.name, launch.case)
+
+
 SASS = """
         /*0000*/                   MOV R1, c[0x0][0x28] ;
 .L_x_0:

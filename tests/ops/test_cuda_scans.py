@@ -117,6 +117,20 @@ def test_half_precision_agrees_with_the_reference(name, dtype, tolerance):
 
 
 @kernel
+@pytest.mark.parametrize("reverse", [False, True])
+def test_states_stored_as_their_products_read_them_change_no_product(monkeypatch, reverse):
+    scan = import_module("asysplat.ops.ssd.cuda")
+    tensors = arguments("ssd", 3 * CHUNKS["ssd"] + 5, dtype=torch.bfloat16)
+    half = run("ssd", tensors, "cuda", reverse)
+    monkeypatch.setitem(scan.STATES, scan.BFLOAT16["DOT"], torch.float32)
+    single = run("ssd", tensors, "cuda", reverse)
+    for part, a, b in zip(("y", *NAMES), half, single, strict=True):
+        # Gradients of decays also take a state times its gradient, in fp32.
+        tolerance = {"dt": 1e-3, "A": 5e-3}.get(part, 0)
+        assert (a - b).norm() <= tolerance * b.norm(), part
+
+
+@kernel
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("reverse", [False, True])
 def test_all_small_and_all_large_steps_and_rates(name, reverse):

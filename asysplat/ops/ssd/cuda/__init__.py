@@ -33,6 +33,8 @@ LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}
 # Types of a product's factors, and its precisions. fp16 lacks the range of a state.
 BFLOAT16 = {"DOT": tl.bfloat16, "PRECISION": "ieee"}
 EXACT = {"DOT": tl.float32, "PRECISION": "ieee"}
+# Types in which states are stored: those of a product's factors, to which it rounds them anyway.
+STATES = {tl.bfloat16: torch.bfloat16, tl.float32: torch.float32}
 # A sum of three TF32 products is as precise as EXACT and several times as fast. It is used only on
 # Hopper, which reads the factors from shared memory: elsewhere they do not fit into registers. And
 # only for factors of at least this size: of smaller ones, Triton 3.6 reads past the end.
@@ -184,7 +186,7 @@ def _compute_states(
 ) -> Float[Tensor, "B chunks H P N"]:
     """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
-    states = decays.new_empty(shape)
+    states = values.new_empty(shape, dtype=STATES[sizes.products["DOT"]])
     options = sizes.launch_kwargs(pass_states)
     if options["DOT"] == tl.float32:
         options |= EXACT  # TF32 is slower for a single product that waits for the chunk before

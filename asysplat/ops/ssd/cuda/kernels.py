@@ -118,8 +118,8 @@ def pass_states(
 ):
     """Pass BLOCK columns of a head's state from chunk to chunk; with GRADIENT, from last to first.
 
-    Written to `states` [B, chunks, H, P, N], in fp32, is the state before each chunk, or with
-    GRADIENT the gradient of the state after it.
+    Written to `states` [B, chunks, H, P, N] is the state before each chunk, or with GRADIENT the
+    gradient of the state after it. What is passed on is in fp32.
     """
     first, head = tl.program_id(0) * BLOCK, tl.program_id(1)
     batch = tl.program_id(2).to(tl.int64)
@@ -128,7 +128,8 @@ def pass_states(
     for k in range(chunks):
         chunk = chunks - 1 - k if GRADIENT else k
         part = (batch * chunks + chunk) * heads + head
-        tl.store(states + state_at(part, first, HEAD_DIM, STATE, BLOCK), state)
+        at = state_at(part, first, HEAD_DIM, STATE, BLOCK)
+        tl.store(states + at, state.to(states.dtype.element_ty))
         row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
         if GRADIENT:
             weight = tl.exp(tl.load(row + SINCE * positions + lane))
@@ -263,7 +264,7 @@ def head_gradients(
         state, grad_state = tl.load(states + at), tl.load(grad_states + at)
         read += product(c, tl.trans(state), DOT, PRECISION)
         grad_input += product(b, tl.trans(grad_state), DOT, PRECISION)
-        through += tl.sum(state * grad_state, 1)
+        through += tl.sum(state.to(tl.float32) * grad_state.to(tl.float32), 1)
     at, inside = rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK)
     value = tl.load(x + at, mask=inside, other=0.0)
     out = tl.load(grad_output + at, mask=inside, other=0.0)
