@@ -109,7 +109,7 @@ def measure_work(scene: Scene) -> RenderingWork:
             "rasterize_backward": NUMBER
             * (visible * SPLAT.value + pairs * GRADIENT.value + 7 * pixels),
             "sum_pairs": NUMBER * (num * 2 + (pairs + visible) * GRADIENT.value),
-            "project_backward": NUMBER * num * (2 * fields + 2 + GRADIENT.value),
+            "project_backward": NUMBER * num * (2 * fields + 1 + GRADIENT.value),
         },
         pairs=pairs,
     )

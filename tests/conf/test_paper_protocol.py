@@ -191,7 +191,11 @@ def test_the_options_for_several_nodes(compose_train):
     """The options of docs/tables.md fit together."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     printed = (ROOT / "docs" / "tables.md").read_text().replace("\\\n", "").splitlines()
-    (line,) = (line for line in printed if "trainer.num_nodes" in line)
+    line, by_torchrun = (line for line in printed if "trainer.num_nodes" in line)
+    launch, _, words = by_torchrun.partition("train.py")
+    assert launch.startswith("torchrun --nnodes 2 --nproc-per-node 8 ")
+    started = compose_train(*words.split()).trainer
+    assert (started.num_nodes, started.devices) == (2, 8)
     config = compose_train("scale=paper", "hydra/launcher=submitit_slurm", *line.split())
     trainer, launcher = config.trainer, config.hydra.launcher
     assert trainer.strategy._target_ == "lightning.pytorch.strategies.DDPStrategy"
