@@ -54,7 +54,7 @@ SCENES = {  # Gaussians, SH degree, height and width
 READ = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal"}
 BY_MASK = {"index", "index_put_", "_index_put_impl_"}  # if an index is boolean
 COPIES = {Tensor.tolist, Tensor.cpu, Tensor.numpy, Tensor.new_tensor}
-TO_A_DEVICE = {torch.tensor, torch.as_tensor}  # if it is given
+TO_A_DEVICE = {torch.tensor, torch.as_tensor}  # copies, where a device is named
 
 
 @dataclass

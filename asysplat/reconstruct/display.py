@@ -14,7 +14,7 @@ from asysplat.scene import Gaussians
 from asysplat.terminal import make_console
 
 BAR_SECONDS = 0.1  # between two updates of the bar
-VIEWER_SECONDS = 1.0  # and of the viewer
+VIEWER_SECONDS = 1.0  # between two updates of the viewer
 PRINT_SECONDS = 10.0  # between two lines where there is no terminal
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -47,7 +47,7 @@ class RefinementProgress:
     fraction: float  # fraction of the refinement that is done, in [0, 1]
     seconds: float  # seconds of its steps so far, without what watches it
     gaussians: int  # their number
-    errors: Sequence[Float[Tensor, ""]]  # squared, of the last steps, one for each input image
+    errors: Sequence[Float[Tensor, ""]]  # mean squared errors of as many steps as input images
 
     @cached_property
     def psnr(self) -> float:

@@ -34,8 +34,10 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     if environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":  # torchrun
         return _of_first_process(partial(_choose_folder, ckpt_path, runs, new))
     if SLURMEnvironment.detect() and int(environ["SLURM_NTASKS"]) > 1:
-        step = environ.get("SLURM_STEP_ID", "0")
-        new = str(Path(new).with_name(f"slurm_{environ['SLURM_JOB_ID']}_{step}"))
+        # A job that is queued again keeps its number, and must not write over what it has.
+        names = ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT")
+        words = ("slurm", *(environ[name] for name in names if name in environ))
+        new = str(Path(new).with_name("_".join(words)))
     return _choose_folder(ckpt_path, runs, new)
 
 

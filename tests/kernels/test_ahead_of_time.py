@@ -50,7 +50,9 @@ def test_every_launch_compiles_and_fits(capability):
     launches = without_repeats(record_launches(capability), capability)
     names = {f"{package}.{name}" for package, names in KERNELS.items() for name in names}
     assert {launch.name for launch in launches} == names
-    assert len(launches) < 100  # variants of kernels
+    variants = Counter(launch.name.partition(".")[0] for launch in launches)
+    assert variants.pop("conv_silu") <= 6 and variants.pop("image_loss") <= 6
+    assert variants.total() < 90
     for launch in launches:
         usage = measure_usage(compile_launch(launch, capability), capability)
         name = f"{launch.name} of {launch.case}"

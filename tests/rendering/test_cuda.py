@@ -280,7 +280,7 @@ def test_pairs_beyond_the_room_are_drawn_again(make_scene, monkeypatch):
     images, grads, stats = run(draw_by_cuda, *scene, settings)
     ((similar, room),) = module._room.items()
     assert room > stats["pairs"] > 16
-    for others in (16, 10 * room):  # of the images before
+    for others in (16, 10 * room):  # pairs that the images before had
         monkeypatch.setattr(module, "_room", {similar: others})
         other = run(draw_by_cuda, *scene, settings)
         assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]]))

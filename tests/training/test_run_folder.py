@@ -117,5 +117,7 @@ def test_processes_of_slurm_get_the_folder_of_their_job(monkeypatch, tmp_path):
     monkeypatch.setenv("SLURM_JOB_NAME", "train")
     expected = str(tmp_path / "slurm_17_3")
     assert {run_folder(None, "", str(tmp_path / new)) for new in ("noon", "later")} == {expected}
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert run_folder(None, "", str(tmp_path / "noon")) == f"{expected}_1"
     monkeypatch.setenv("SLURM_NTASKS", "1")
     assert run_folder(None, "", str(tmp_path / "noon")) == str(tmp_path / "noon")

@@ -65,8 +65,8 @@ def forward_band(
     weight,
     bias,
     y,
-    sequence_stride,  # in units
-    stride,  # of tokens, in units
+    sequence_stride,  # units from a sequence to the next
+    stride,  # units from a token to the next
     length,
     channels,
     UNIT: tl.constexpr,
@@ -96,8 +96,8 @@ def backward_band(
     bias,
     grad_tokens,
     parts,  # [B, bands, SIZE + 1, C], the band's gradients of the weights and, last, the bias
-    sequence_stride,  # in units
-    stride,  # of tokens, in units
+    sequence_stride,  # units from a sequence to the next
+    stride,  # units from a token to the next
     length,
     channels,
     g_sequence_stride,
