@@ -271,6 +271,25 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
     assert listed.sum() <= 1.05 * touched.sum()
 
 
+@pytest.mark.skipif(not INTERPRETED, reason="a GPU orders its programs itself")
+def test_programs_in_reversed_order_give_the_same_bits(make_scene, monkeypatch):
+    from triton.runtime.interpreter import interpreter_builder
+
+    scene, settings = make_batch(make_scene, views=2, device=DEVICE), RenderSettings()
+    images, grads, stats = run(draw_by_cuda, *scene, settings)
+    place, placed = interpreter_builder.set_grid_idx, []
+
+    def mirror(*program):
+        counts = interpreter_builder.grid_dim
+        placed.append(tuple(n - 1 - i for n, i in zip(counts, program, strict=True)))
+        place(*placed[-1])
+
+    monkeypatch.setattr(interpreter_builder, "set_grid_idx", mirror)
+    other = run(draw_by_cuda, *scene, settings)
+    assert placed != sorted(placed) and other[2] == stats
+    assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]]))
+
+
 @kernel
 def test_pairs_beyond_the_room_are_drawn_again(make_scene, monkeypatch):
     from asysplat.rendering.cuda import draw as module
