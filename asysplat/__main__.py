@@ -17,6 +17,7 @@ COMMANDS = {
     "view": ("asysplat.export.viewer", "a scene of Gaussians in the browser"),
     "export": ("asysplat.export", "a scene of Gaussians in another format, or smaller"),
     "check": ("asysplat.data.check", "do the cameras of a scene fit its images?"),
+    "prepare": ("asysplat.data.prepare", "scenes for training: small files that are read fast"),
     "cameras": ("asysplat.data.cameras", "find the cameras of photographs"),
     "train": ("train.py", "train and test a model, or all models of a table"),
     "evaluate": ("evaluate.py", "measure a model, or files of Gaussians"),

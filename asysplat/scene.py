@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from asysplat.errors import InputError
@@ -218,7 +218,7 @@ class Views(TensorRecord):
 
     Args:
         cameras: V cameras.
-        images: [..., V, 3, H, W] RGB in [0, 1].
+        images: [..., V, 3, H, W] RGB in [0, 1], or as files store it: uint8 in 0..255.
         depths: [..., V, H, W] along the camera's z axis, in scene units; 0 if unknown.
         masks: [..., V, H, W], True where a pixel counts.
         alphas: [..., V, H, W] opacity of the photographed object in [0, 1]: 0 where a pixel shows
@@ -238,7 +238,7 @@ class Views(TensorRecord):
     """
 
     cameras: Cameras
-    images: Float[Tensor, "*batch V 3 H W"]
+    images: Float[Tensor, "*batch V 3 H W"] | UInt8[Tensor, "*batch V 3 H W"]
     depths: Float[Tensor, "*batch V H W"] | None = None
     masks: Bool[Tensor, "*batch V H W"] | None = None
     alphas: Float[Tensor, "*batch V H W"] | None = None
@@ -252,7 +252,8 @@ class Views(TensorRecord):
             )
         batch = self.cameras.intrinsics.shape[:-2]
         size = (self.cameras.height, self.cameras.width)
-        _check_float("Views.images (RGB in [0, 1])", self.images)
+        if getattr(self.images, "dtype", None) != torch.uint8:
+            _check_float("Views.images (RGB in [0, 1])", self.images)
         _check_exact("Views.images", self.images, (*batch, 3, *size))
         for name in MAPS:
             if getattr(self, name) is not None:
@@ -269,6 +270,12 @@ class Views(TensorRecord):
         selected = {n: m.index_select(-3, index) for n, m in maps.items() if m is not None}
         images = self.images.index_select(-4, index)
         return replace(self, cameras=self.cameras.select(index), images=images, **selected)
+
+    def decoded(self) -> "Views":
+        """Return views whose images are in [0, 1]."""
+        if self.images.dtype != torch.uint8:
+            return self
+        return replace(self, images=self.images.float() / 255)
 
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.
@@ -351,12 +358,13 @@ class Views(TensorRecord):
             InputError: as for `Cameras.validate`; also images outside [0, 1] or depths below 0.
         """
         self.cameras.validate(f"{name}.cameras")
-        _check_finite(f"{name}.images", self.images, 3)
-        _check_all(
-            f"{name}.images",
-            ((self.images >= 0) & (self.images <= 1)).all(-1).all(-1).all(-1),
-            "has values outside [0, 1]: divide 8-bit images by 255",
-        )
+        if self.images.dtype != torch.uint8:
+            _check_finite(f"{name}.images", self.images, 3)
+            _check_all(
+                f"{name}.images",
+                ((self.images >= 0) & (self.images <= 1)).all(-1).all(-1).all(-1),
+                "has values outside [0, 1]: divide 8-bit images by 255",
+            )
         distances = "distances along the camera's z axis"
         units = {"depths": distances, "point_depths": distances, "disparities": "inverse depths"}
         for field, unit in units.items():

@@ -108,8 +108,6 @@ def tables() -> dict[str, str]:
     forms = {
         "JPEG for 540x960 (bytes a pixel as above)": jpeg_bytes,
         "JPEG 90 of 256x256": median(row["jpeg_bytes_256"] for row in files),
-        "the cache's arrays of 256x256": 3 * 256 * 256,
-        "the cache's arrays of 544x960": 3 * 544 * 960,
         "disparities of 272x484": scaling["disparity_bytes"],
     }
     rendered = [

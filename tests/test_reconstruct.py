@@ -220,7 +220,7 @@ def test_masked_photographs_measure_alike_by_both_scripts(
     finished(command(photographs, init, "steps=1", "video.path=none"))
     expected = numbers_of(tmp_path / "run")
     data = ["data=files", f"data.root={photographs}", "data.inputs=2"]
-    data += [f"data.height={SIZE}", f"data.width={SIZE}", "data.cache.folder=null"]
+    data += [f"data.height={SIZE}", f"data.width={SIZE}"]
     data += ["data.num_workers=0", f"paths.logs={tmp_path}", "post_optimization_steps=0"]
     for suffix in ("ply", "safetensors"):
         scene = tmp_path / "run" / f"scene.{suffix}"

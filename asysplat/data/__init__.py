@@ -5,7 +5,6 @@ from asysplat.root import import_later
 LATER = {
     "Augmentation": "asysplat.data.augment",
     "FilesSource": "asysplat.data.sources",
-    "ImageCache": "asysplat.data.cache",
     "ProceduralScene": "asysplat.data.procedural",
     "ProceduralSource": "asysplat.data.sources",
     "SceneDataModule": "asysplat.data.datamodule",

@@ -62,6 +62,7 @@ class Augmentation:
         noise = rng.uniform(0, self.noise)
         inputs, targets = brighten(inputs, stops + flicker), brighten(targets, stops[None])
         if noise:
+            inputs = inputs.decoded()
             grain = torch.from_numpy(rng.standard_normal(inputs.images.shape, np.float32))
             noisy = inputs.images + noise * grain.to(inputs.images)
             inputs = replace(inputs, images=noisy.clamp(0, 1))
@@ -73,6 +74,9 @@ def brighten(views: Views, stops: Float[np.ndarray, "#V 3"]) -> Views:
 
     Images store light to the power of 1 / GAMMA.
     """
+    if not stops.any():
+        return views
+    views = views.decoded()
     gains = torch.from_numpy(2 ** (stops / GAMMA)).to(views.images)
     return replace(views, images=(views.images * gains[..., None, None]).clamp(max=1))
 
@@ -90,6 +94,7 @@ def center_crop(views: Views, fraction: float) -> Views:
     rows, columns = max(1, round(fraction * height)), max(1, round(fraction * width))
     if (rows, columns) == (height, width):
         return views
+    views = views.decoded()
     top, left = (height - rows) // 2, (width - columns) // 2
 
     images = views.images[..., top : top + rows, left : left + columns]

@@ -22,6 +22,7 @@ from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
 from asysplat.data.normalize import Normalization, depths_of_points, normalize
 from asysplat.data.selection import Selection
+from asysplat.data.sequence import FileSequence
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -275,9 +276,10 @@ class FixedTasks(Dataset):
         return len(self.tasks)
 
     def __getitem__(self, index: int) -> Sample:
-        if index < len(self._loaded):
-            return self._loaded[index]
-        return load(self.tasks[index], points=self.points)
+        known = index < len(self._loaded)
+        sample = self._loaded[index] if known else load(self.tasks[index], points=self.points)
+        inputs, targets = sample["inputs"].decoded(), sample["targets"].decoded()
+        return {**sample, "inputs": inputs, "targets": targets}
 
 
 def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
@@ -289,16 +291,18 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
     inputs, targets = task.selection.inputs, task.selection.targets
     # An image that is both input and target is decoded once.
     indices = list(dict.fromkeys(inputs + targets))
-    views = center_crop(task.sequence.views(indices).validate(task.sequence.name), crop)
+    sequence = task.sequence
+    read = sequence.stored if isinstance(sequence, FileSequence) else sequence.views
+    views = center_crop(read(indices).validate(sequence.name), crop)
     inputs, targets = (
         views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )
-    sparse = task.sequence.points if points else None
+    sparse = sequence.points if points else None
     if sparse is not None:
         inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
     return {
-        "scene": task.sequence.name,
+        "scene": sequence.name,
         "prune": task.prune,
         "inputs": inputs,
         "targets": targets,
@@ -307,10 +311,13 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
 
 
 def collate(samples: list[Sample]) -> Batch:
+    inputs, targets = ([sample[views] for sample in samples] for views in ("inputs", "targets"))
+    if len({views.images.dtype for views in inputs}) > 1:  # of images that augmentation changed
+        inputs, targets = ([v.decoded() for v in views] for views in (inputs, targets))
     return {
         "scene": [sample["scene"] for sample in samples],
-        "inputs": Views.stack([sample["inputs"] for sample in samples]),
-        "targets": Views.stack([sample["targets"] for sample in samples]),
+        "inputs": Views.stack(inputs),
+        "targets": Views.stack(targets),
         "prune": all(sample.get("prune", True) for sample in samples),
         "bad_scenes": [error for sample in samples for error in sample.get("bad_scenes", ())],
     }

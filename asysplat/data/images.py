@@ -9,7 +9,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -45,10 +45,10 @@ TWO_FOCALS = {  # COLMAP's models with one focal length; with two, more paramete
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """The bytes of an image file inside another file; `name` is for error messages."""
+    """An image file inside another file, whose bytes `read` returns; `name` is for messages."""
 
     name: str
-    data: UInt8[ndarray, "bytes"]
+    read: Callable[[], bytes]
 
     def __str__(self) -> str:
         return self.name
@@ -116,7 +116,7 @@ class Lens:
         camera.params = [*params, *camera.params[len(params) :]]
         return camera
 
-    @property
+    @cached_property
     def is_distorted(self) -> bool:
         # A fisheye is not a pinhole even with all coefficients 0.
         camera = self.camera()
@@ -224,6 +224,8 @@ def resize_and_crop(
     By `resampling`, or the pixel under each new center with `nearest`; of booleans, True where all
     pixels are that the new one covers.
     """
+    if pixels.shape[:2] == (height, width):
+        return pixels
     box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)[1:]
     if pixels.dtype == bool:
         coverage = Image.fromarray(pixels.astype(np.float32))
@@ -296,7 +298,7 @@ def _to_alpha(image: Image.Image) -> UInt8[ndarray, "h w"]:
 def content_hash(file: ImageFile) -> str:
     """Hash the stored bytes; a file is read again only if it changes."""
     if isinstance(file, EncodedImage):
-        return hashlib.blake2b(file.data.tobytes(), digest_size=16).hexdigest()
+        return hashlib.blake2b(file.read(), digest_size=16).hexdigest()
     _check_exists(file)
     stat = file.stat()
     return _hash_file(file, stat.st_size, stat.st_mtime_ns)
@@ -332,7 +334,7 @@ def _read(file: ImageFile, extract: Callable[[OpenedImage], Content]) -> Content
                     "save it as JPEG."
                 )
             formats = (*FORMATS, "HEIF")
-    stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())
+    stored = file if isinstance(file, Path) else BytesIO(file.read())
     try:
         with Image.open(stored, formats=formats) as image:
             return extract(image)

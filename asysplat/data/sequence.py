@@ -1,6 +1,5 @@
 """Posed images of one place: the interface that all of them follow, and the images on disk."""
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,17 +9,15 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.bad_images import BadImages, Policy
-from asysplat.data.cache import ImageCache
 from asysplat.data.images import (
     ImageFile,
     Lens,
     Resampling,
-    content_hash,
     load_alpha,
     load_depth,
     load_mask,
@@ -75,7 +72,6 @@ class SceneOptions:
             leaves those images out with a warning, and decodes each image once to find them.
         masks: whether masks are of an object or of what to ignore; see `with_masks`.
         resampling: how photographs and alphas are resized, see `Resampling`.
-        cache: keeps decoded pixels; None keeps none.
         disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
     """
 
@@ -85,7 +81,6 @@ class SceneOptions:
     on_error: Policy = "fail"
     masks: MasksOf = "auto"
     resampling: Resampling = "lanczos"
-    cache: ImageCache | None = None
     disparities: Path | str | None = None
 
 
@@ -106,12 +101,12 @@ class PosedImage:
     file: ImageFile
     lens: Lens
     cam_to_world: Float[ndarray, "4 4"]
-    depth: Path | None = None
+    depth: ImageFile | None = None
     depth_unit: float = 1.0
-    mask: Path | None = None
+    mask: ImageFile | None = None
     is_object: bool = False
     held_out: bool = False
-    disparity: Path | None = None
+    disparity: ImageFile | None = None
 
 
 @dataclass(frozen=True)
@@ -194,7 +189,10 @@ class FileSequence:
         return self.scene.points
 
     def views(self, indices: Sequence[int]) -> Views:
-        """Return the images at `indices`, in that order."""
+        return self.stored(indices).decoded()
+
+    def stored(self, indices: Sequence[int]) -> Views:
+        """Return the images at `indices`, in that order, as uint8."""
         images = [self.scene.images[index] for index in indices]
 
         def stack(available: bool, read: Callable[[PosedImage], Tensor]) -> Tensor | None:
@@ -222,7 +220,7 @@ class FileSequence:
                 intact.append(image)
         return self.with_images(intact)
 
-    def _image(self, image: PosedImage) -> Float[Tensor, "3 H W"]:
+    def _image(self, image: PosedImage) -> UInt8[Tensor, "3 H W"]:
         # A reduced image is antialiased.
         factor = math.inf if self.options.resampling == "bilinear" else OVERSAMPLING
         least = factor * max(self.options.height, self.options.width)
@@ -230,10 +228,10 @@ class FileSequence:
         def load_photograph(file: ImageFile) -> ndarray:
             return load_reduced(file, least)
 
-        pixels = self._pixels(image.file, load_photograph, image.lens)
-        pixels = pixels.permute(2, 0, 1).float() / 255
-        if image.is_object and image.mask != image.file:
-            return 1 - self._alpha(image) * (1 - pixels)
+        pixels = self._pixels(image.file, load_photograph, image.lens).permute(2, 0, 1)
+        # Transparent photographs and prepared ones are on white.
+        if image.is_object and isinstance(image.mask, Path) and image.mask != image.file:
+            return (255 - self._alpha(image) * (255 - pixels.float())).round().byte()
         return pixels
 
     def _alpha(self, image: PosedImage) -> Float[Tensor, "H W"]:
@@ -267,24 +265,16 @@ class FileSequence:
             return torch.tensor(self._fit(np.ones((lens.height, lens.width), dtype=bool), lens))
         return self._pixels(image.mask, load_mask, lens)
 
-    def _map(self, file: Path | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
+    def _map(self, file: ImageFile | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
         """Return unmixed values at this sequence's size; 0 without a file."""
         if file is None:
             return torch.zeros(self.options.height, self.options.width)
         return self._pixels(file, load, lens, nearest=True)
 
     def _pixels(self, file: ImageFile, load: Load, lens: Lens, nearest: bool = False) -> Tensor:
-        """Return a file's pixels at this sequence's size, from the cache if they are there."""
-
-        cache, size = self.options.cache, (self.options.height, self.options.width)
-        # Arrays are copied, since those from the cache and from Pillow are read-only.
-        if cache is None:
-            return torch.tensor(self._fit(load(file), lens, nearest))
-        made_from = repr((lens, *size, load.__name__, self.options.resampling)).encode()
-        key = f"{content_hash(file)}-{hashlib.blake2b(made_from, digest_size=8).hexdigest()}"
-        # Pixels that are neither undistorted nor resized are as quickly decoded again.
-        changed = lens.is_distorted or (lens.height, lens.width) != size
-        return torch.tensor(cache.get(key, lambda: self._fit(load(file), lens, nearest), changed))
+        """Return a file's pixels at this sequence's size."""
+        # A copy, since arrays from Pillow are read-only.
+        return torch.tensor(self._fit(load(file), lens, nearest))
 
     def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> ndarray:
         pixels = undistort(pixels, lens, nearest)

@@ -91,7 +91,7 @@ class Network(nn.Module, ABC):
         self.check_views(views.num_views)
         if not (self.training or views.images.is_meta or is_fake(views.images)):
             views.validate("the network's views")  # in training the data module does
-        batch = views.images.shape[:-4]
+        views, batch = views.decoded(), views.images.shape[:-4]
         self.early_exit_fractions.clear()
         gaussians = self.predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
         if prune:

@@ -91,7 +91,7 @@ class Refinement:
         if gaussians.num_gaussians == 0:
             raise InputError("refine got no Gaussians: start from at least one.")
         gaussians.validate("refine's gaussians")
-        self.views = views.validate("refine's views")
+        self.views = views = views.validate("refine's views").decoded()
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings = settings
         if background is None:

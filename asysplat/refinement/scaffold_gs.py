@@ -337,7 +337,7 @@ def refine_scaffold(
     if gaussians.num_gaussians == 0:
         raise InputError("refine_scaffold got no Gaussians: start from at least one.")
     gaussians.validate("refine_scaffold's gaussians")
-    views.validate("refine_scaffold's views")
+    views = views.validate("refine_scaffold's views").decoded()
     color = views.color_behind(views.mean_color()) if background is None else background
     points = gaussians.means.detach().float()
     if seconds is not None:  # a step with few anchors compiles the kernels before the time runs

@@ -41,7 +41,7 @@ NOT_HASHED = (
     *("stage", "stages", "earlier_stages", "selections", "windows"),
     *("more_inputs", "replica_size", "farthest"),
     *("allow_missing_losses", "training.loss.allow_missing"),
-    *("data.root", "data.index", "data.cache", "data.test_sets"),
+    *("data.root", "data.index", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
     *("trainer.num_sanity_val_steps", "data.micro_batch"),
     *("training.checkpoint_layers", "training.compile", "training.views_at_once"),

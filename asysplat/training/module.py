@@ -108,6 +108,8 @@ class SplattingModule(lightning.LightningModule):
 
     def compute_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Compute "loss", which has gradients, its terms and "psnr": means over the scenes."""
+        views = {name: batch[name].decoded() for name in ("inputs", "targets")}
+        batch = {**batch, **views}
         # In parallel on a CPU; copies of a network of sharded parameters could not gather them.
         on_cpu = self.device.type == "cpu" and self.device_mesh is None
         if on_cpu and len(batch["scene"]) > 1:

@@ -13,7 +13,7 @@ from benchmarks.table import format_json
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 FILES = [path for path in sorted(FOLDER.rglob("*.json")) if path.stem in SUITES]
 # What each suite measures of a row, and the factor that makes it worse.
-MEASURED = {"data": ("frames_per_second", 0.1), "bench": ("ratio", 10), "pareto": ("seconds", 10)}
+MEASURED = {"data": ("views_per_second", 0.1), "bench": ("ratio", 10), "pareto": ("seconds", 10)}
 MEASURED |= {"stability": ("error", 10), "formats": ("write", 10), "device": ("kernels", 10)}
 MEASURED |= {"machine_code": ("instructions", 2), "launches": ("launches", 2)}
 MEASURED |= {"depths": ("absrel", 10)} | dict.fromkeys(("systems", "public"), ("psnr", 0.1))

@@ -65,12 +65,14 @@ def test_a_workload_that_became_slower_is_named(monkeypatch):
 
 
 @pytest.mark.medium
-def test_data_is_opened_and_loaded_with_and_without_a_cache(run_suite):
-    small = {"frames": 24, "photographs": [36, 64], "num_workers": 0}
+def test_photographs_and_prepared_scenes_are_loaded(run_suite):
+    small = {"scenes": 2, "frames": 24, "photographs": [36, 64], "num_workers": 0}
+    small |= {"views": [16, 16], "inputs": 4, "targets": 2, "tasks": 2}
     results = run_suite("data", {"data": small})
-    assert results["scene"]["frames"] == 24 and results["open"]["median"] > 0
-    assert [row["cache"] for row in results["loading"]] == list(data.CACHES)
-    assert all(row["frames_per_second"]["median"] > 0 for row in results["loading"])
+    assert results["scenes"]["frames"] == 24 and results["prepare"] > 0
+    assert [row["source"] for row in results["loading"]] == list(data.SOURCES)
+    assert all(row["views_per_second"]["median"] > 0 for row in results["loading"])
+    assert [row["container"] for row in results["containers"]] == ["tar", "zip", "prepared"]
 
 
 @pytest.mark.medium

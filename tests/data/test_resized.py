@@ -66,7 +66,7 @@ def test_images_that_are_distorted_or_inside_other_files_are_unchanged(scene, tm
     save(tmp_path / "images_2", ("a7.JPG", "c3.JPG"), 23, 15)
     first, second = scene.images
     lens = replace(LENS, model="OPENCV", distortion=(0.1, 0.0, 0.0, 0.0))
-    encoded = EncodedImage("chunk, frame 0", np.zeros(4, dtype=np.uint8))
+    encoded = EncodedImage("chunk, frame 0", bytes)
     for other in (replace(first, lens=lens), replace(first, file=encoded)):
         changed = replace(scene, images=[other, second])
         assert as_published(changed, 15, 23) == (changed, None)

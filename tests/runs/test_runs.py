@@ -44,8 +44,11 @@ def write_run(tmp_path):
 SAME = [
     *("metrics=default", "seed=5", "logger=none", "name=other", "paths.logs=/b/logs", "rerun=true"),
     *("data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/", "data.disparities=/b/disparities"),
-    *("data.cache.folder=/b/cache", "data.cache.memory_gb=2", "data.num_workers=3"),
-    *("paths.weights=/b/weights", "training.loss.perceptual_term.backbone_dir=/c"),
+    *(
+        "data.num_workers=3",
+        "paths.weights=/b/weights",
+        "training.loss.perceptual_term.backbone_dir=/c",
+    ),
     *("test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2", "callbacks.figures.scenes=0"),
     *("trainer=ddp", "trainer.devices=4", "trainer.num_nodes=2"),
     *("data.micro_batch=1", "training.checkpoint_layers=true"),
@@ -225,7 +228,7 @@ OTHER_EVALUATION = {
 def test_other_options_are_another_evaluation(scene_folder, files, case):
     weights = f"init_path={files[0]}"
     first = scene_folder(weights, *GARDEN)
-    assert scene_folder(weights, *GARDEN, "data.cache.folder=null", "paths.weights=/b") == first
+    assert scene_folder(weights, *GARDEN, "data.num_workers=3", "paths.weights=/b") == first
     assert scene_folder(weights, *OTHER_EVALUATION[case]) != first
 
 

@@ -174,7 +174,7 @@ def photographs(tmp_path_factory) -> Path:
     return folder
 
 
-ON_DISK = ["data=files", "data.cache.folder=null", "data.window=[12,24]", "data.val_scenes=1"]
+ON_DISK = ["data=files", "data.window=[12,24]", "data.val_scenes=1"]
 
 
 @pytest.fixture(scope="module")

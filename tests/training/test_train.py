@@ -164,7 +164,7 @@ def test_bfloat16_with_the_perceptual_term_and_a_protocol_by_name(train, shared)
 def test_training_on_a_real_scene_leaves_its_files(train, shared, name):
     scene = shared / "data" / name
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
-    folder = finished(train("data=files", f"data.root={scene}", "data.cache.folder=null"))
+    folder = finished(train("data=files", f"data.root={scene}"))
     assert metrics(folder)["test/files/psnr"] > 5
     assert ("test/files/absrel" in metrics(folder)) == (name == "hololens-000")
     assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before

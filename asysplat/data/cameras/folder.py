@@ -12,7 +12,7 @@ from PIL.ExifTags import Base
 from rich.console import Console
 from rich.progress import Progress
 
-from asysplat.data.images import HEIF, image_size, load_mask
+from asysplat.data.images import HEIF, ImageFile, image_size, load_mask
 from asysplat.data.readers.additions import MASKS
 from asysplat.data.readers.common import check_map_size
 from asysplat.files import check_room, make_folder
@@ -76,7 +76,7 @@ def link_photograph(file: Path, link: Path, upright: bool = False) -> None:
         image.save(link, exif=image.getexif(), quality=JPEG_QUALITY)
 
 
-def save_mask(mask: Path | None, image: Path) -> None:
+def save_mask(mask: ImageFile | None, image: Path) -> None:
     """Write the mask of images/NAME, if there is one, to masks/NAME.png beside."""
     if mask is None:
         return

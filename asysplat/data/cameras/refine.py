@@ -61,7 +61,7 @@ def refine_cameras(
     assert len(images) == len(scene.images)  # files, each once
     names = colmap_names(images)
     cameras = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
-    masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
+    masks = [m for file, image in images.items() if isinstance(m := image.mask, Path) and m != file]
     method = f"matched {USUAL} {LEAST_OF_LENS} {cameras}"
     folder = where / f"{scene.name}-refined-{digest(method, [*images, *masks])}"
     if not folder.is_dir():

@@ -29,6 +29,7 @@ from asysplat.data.readers import (
     middlebury,
     posed,
     posediffusion,
+    prepared,
     realestate10k,
     replica,
     scannetpp,
@@ -43,17 +44,20 @@ from asysplat.files import check_exists
 
 # In this order: the first layout that fits a folder reads it.
 READERS = (
-    *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, blender, llff, posed, idr),
-    *(middlebury, posediffusion, colmap, scannetpp_depths),
+    *(prepared, long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, blender, llff),
+    *(posed, idr, middlebury, posediffusion, colmap, scannetpp_depths),
 )
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 
 
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
-    """Return the layout of the scenes that `root` is or holds, and the scenes."""
+    """Return the layout of the scenes that `root` is or holds, and the scenes.
+
+    Scenes of any layout may have been prepared.
+    """
     _check_layout(layout)
     root = Path(root).absolute()
-    for name in LAYOUTS if layout == "auto" else (layout,):
+    for name in LAYOUTS if layout == "auto" else ("prepared", layout):
         with file_errors(root):
             scenes = LAYOUTS[name].find_scenes(root)
         if scenes:
@@ -97,12 +101,20 @@ def photographs_in(root: Path) -> list[Path]:
     return sorted(images_in(root) or images_in(root / "images"), key=natural_order)
 
 
-def read_scene(layout: str, scene: Path, bad: BadImages, masks: MasksOf = "auto") -> PosedScene:
+def read_scene(
+    layout: str,
+    scene: Path,
+    bad: BadImages,
+    masks: MasksOf = "auto",
+    size: tuple[int, int] | None = None,
+) -> PosedScene:
     """Read one of the `find_scenes` with its images' masks, and panoramas as their faces.
 
-    Errors of single images are collected.
+    Errors of single images are collected. `size`, height and width, chooses a prepared file.
     """
     with file_errors(scene):
+        if layout == "prepared":  # with masks, and faces
+            return prepared.read_scene(scene, bad, size)
         return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad, masks), bad)
 
 
@@ -116,7 +128,7 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
     bad = BadImages(options.on_error)
-    posed = read_scene(layout, path, bad, options.masks)
+    posed = read_scene(layout, path, bad, options.masks, (options.height, options.width))
     if options.disparities is not None:
         posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)

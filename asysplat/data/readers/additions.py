@@ -40,7 +40,7 @@ def with_masks(scene: PosedScene, bad: BadImages, masks: MasksOf = "auto") -> Po
         return replace(image, is_object=is_object)
 
     images = bad.read_each(read, ((image,) for image in scene.images))
-    separate = [image.mask for image in images if image.mask not in (None, image.file)]
+    separate = [i.mask for i in images if isinstance(i.mask, Path) and i.mask != i.file]
     if separate and masks != "ignore" and (masks == "object" or are_of_an_object(separate)):
         images = [replace(image, is_object=image.mask is not None) for image in images]
     return replace(scene, images=images)

@@ -10,18 +10,19 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.images import HEIF, Lens, image_size, same_proportions
+from asysplat.data.images import HEIF, ImageFile, Lens, image_size, same_proportions
 from asysplat.errors import InputError, brief
 from asysplat.files import read_json
 from asysplat.scene import MAX_FIELD_OF_VIEW, ORTHONORMAL_TOLERANCE
 
+File = TypeVar("File", bound=ImageFile)
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg", *HEIF)
 HALF_A_PIXEL = 0.5  # to be added to principal points where the first pixel's center is at 0
@@ -113,7 +114,7 @@ def refuse_turned(size: tuple[int, int], lens_size: tuple[int | float, int | flo
         )
 
 
-def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
+def check_map_size(path: File, size: tuple[int, int], where: str) -> File:
     """Return the path of a depth map or mask, after checking that it shows the whole image."""
     width, height = image_size(path)
     if not same_proportions((width, height), size):

@@ -53,7 +53,8 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     cameras = entry["cameras"].double().numpy()
 
     def read(index: int, image: Tensor) -> PosedImage:
-        camera, encoded = cameras[index], EncodedImage(f"{scene}, frame {index}", image.numpy())
+        stored = image.numpy()
+        camera, encoded = cameras[index], EncodedImage(f"{scene}, frame {index}", stored.tobytes)
         width, height = image_size(encoded)
         fx, fy, cx, cy, *unused = camera[:6].tolist()
         if any(unused):

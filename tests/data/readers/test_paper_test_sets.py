@@ -9,7 +9,7 @@ from layouts import colmap, dl3dv, realestate10k, replica
 from asysplat.errors import InputError
 
 TINY = ["data.inputs=4", "data.targets=2", "data.window=[8,12]", "data.val_scenes=1"]
-TINY += ["data.height=16", "data.width=16", "data.cache.folder=null", "data.num_workers=0"]
+TINY += ["data.height=16", "data.width=16", "data.num_workers=0"]
 
 
 @pytest.fixture(scope="module")
