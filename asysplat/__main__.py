@@ -20,6 +20,7 @@ COMMANDS = {
     "prepare": ("asysplat.data.prepare", "scenes for training: small files that are read fast"),
     "cameras": ("asysplat.data.cameras", "find the cameras of photographs"),
     "train": ("train.py", "train and test a model, or all models of a table"),
+    "import": ("asysplat.import_weights", "weights that Long-LRM's public code trained"),
     "evaluate": ("evaluate.py", "measure a model, or files of Gaussians"),
     "report": ("report.py", "finished runs beside the paper's tables"),
     "benchmark": ("benchmark.py", "run time against error"),

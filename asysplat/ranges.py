@@ -19,6 +19,7 @@ PositiveFraction = Annotated[float, Field(gt=0, le=1)]
 TRAINING = {
     **dict.fromkeys(("steps", "validate_every", "state_size", "trainer.num_nodes"), Count),
     **dict.fromkeys(("width", "parameter_budget", "learning_rate"), Positive),
+    "ema": Annotated[float, Field(gt=0, lt=1)] | None,
     "seed": Annotated[int, Field(ge=0, lt=2**32)],  # as NumPy takes them
     "geometry_ratio": Annotated[float, Field(gt=0, lt=1)] | None,
     **dict.fromkeys(("data.inputs", "data.targets", "data.height", "data.width"), Count),

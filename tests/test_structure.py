@@ -32,7 +32,7 @@ LAYERS = (
     ("training",),
     ("load",),
     ("reconstruct",),
-    ("doctor", "__main__"),
+    ("doctor", "import_weights", "__main__"),
 )
 
 

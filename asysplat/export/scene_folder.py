@@ -21,6 +21,9 @@ from asysplat.scene import Cameras, Gaussians
 
 CAMERAS_SUFFIX = ".cameras.json"  # of <scene>.cameras.json beside <scene>.ply, a transforms.json
 MODEL = "sparse/0"  # COLMAP model in the folder <scene>/, in place of <scene>.cameras.json
+# Files that Long-LRM writes, as <scene>/gaussians_001.ply and with numpy.savetxt beside it:
+# https://github.com/arthurhero/Long-LRM/blob/main/model/llrm.py (save_evaluation_results)
+LONG_LRM, MOTION, SCALE = "gaussians_*.ply", "pos_avg_inv.txt", "scene_scale.txt"
 MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a fraction of their spread
 # A view shows nothing if it has Gaussians in a smaller fraction of its pixels, at a height and
 # width of COVERAGE_SIZE; half of the views must show something.
@@ -41,9 +44,12 @@ class SceneFile:
 
         Returns:
             The Gaussians; the root mean square residual of the fit, as a fraction of the spread of
-            the cameras, or None without cameras: the file is then in the data's world.
+            the cameras, or None without cameras: the file is then in the data's world, or in
+            Long-LRM's frame, see `_read_long_lrm`.
         """
         cameras = self._cameras()
+        if cameras is None and self.path.with_name(MOTION).is_file():
+            return self._read_long_lrm(), None
         if cameras is None:
             return read_gaussians(self.path, world_origin(self.sequence), torch.float64), None
         where, poses = cameras
@@ -63,6 +69,14 @@ class SceneFile:
             )
         gaussians = read_gaussians(self.path, origin.tolist(), torch.float64)
         return transform(gaussians, motion).scale_by(scale), residual
+
+    def _read_long_lrm(self) -> Gaussians:
+        """Read Gaussians at x' = SCALE (MOTION x), where x is in the coordinates of the data."""
+        to_data = torch.linalg.inv(torch.tensor(np.loadtxt(self.path.with_name(MOTION))))
+        to_data[:3, 3] -= torch.tensor(world_origin(self.sequence)).to(to_data)
+        scale = float(np.loadtxt(self.path.with_name(SCALE)))
+        gaussians = read_gaussians(self.path, dtype=torch.float64)
+        return transform(gaussians.scale_by(1 / scale), to_data)
 
     def _cameras(self) -> tuple[Path, NamedPoses] | None:
         """Read the cameras beside the file, if there are any: where, and names and poses."""
@@ -97,7 +111,8 @@ class SceneFile:
 def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, SceneFile]:
     """Find the file of every scene of the data, by the scene's name.
 
-    `scenes` is a folder with a file for each, named as the scene; or the file of the only scene.
+    `scenes` is a folder with a file for each, named as the scene, or with the folders that Long-LRM
+    writes, named so; or the file of the only scene.
     """
     option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds, listed = ", ".join(READERS), list_names(data)
@@ -110,22 +125,23 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
         return {name: SceneFile(scenes, sequence) for name, sequence in data.items()}
     if not scenes.is_dir():
         raise InputError(f"{option} is not a file and no folder: name an existing one.")
-    files = sorted(path for path in scenes.iterdir() if path.suffix.lower() in READERS)
+    files = {path: path.stem for path in scenes.iterdir() if path.suffix.lower() in READERS}
+    files = files or {path: path.parent.name for path in scenes.glob(f"*/{LONG_LRM}")}
     if not files:
         raise InputError(f"{option} has no scene ({kinds}): write one for each of {listed}.")
     paths: dict[str, Path] = {}
-    for path in files:
-        if path.stem in paths:
+    for path, name in sorted(files.items()):
+        if name in paths:
             raise InputError(
-                f"{option} has two files of one scene, {paths[path.stem].name} and {path.name}: "
+                f"{option} has two files of one scene, {paths[name].name} and {path.name}: "
                 "remove one."
             )
-        if path.stem not in data:
+        if name not in data:
             raise InputError(
                 f"{path} is named as no scene of the data: rename or remove it; the scenes are "
                 f"{listed}."
             )
-        paths[path.stem] = path
+        paths[name] = path
     if missing := sorted(data.keys() - paths.keys()):
         raise InputError(
             f"{option} has no file of {len(missing)} of the {len(data)} scenes, "

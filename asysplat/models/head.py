@@ -101,6 +101,10 @@ class GaussianHead(nn.Module, ABC):
             decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities, sh)
             return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
 
+    def unit(self, views: Views) -> Float[Tensor, "B 1 1 1 1"] | float:
+        """Return the unit of length of the ray moments that the network reads."""
+        return 1.0
+
     @abstractmethod
     def depth_fraction(
         self, distance: Float[Tensor, "B V h w"], views: Views
@@ -168,10 +172,10 @@ class LongLRMHead(GaussianHead):
     """The head of Long-LRM (Ziwen et al. 2025), with the values of its configs/7m1t_tm.yaml.
 
     Colors and sizes are direct, sizes in units of the scene and at most e^largest; the distance
-    along the ray is linear from 0 to `farthest`. The unit is Long-LRM's, the largest coordinate of
-    an input camera, which is 1/sqrt(3) to 1 in a normalized scene (`asysplat.data.normalize`: the
-    farthest camera is at distance 1). It renders with a near plane at 0.01, as `asysplat.rendering`
-    does, and a far one at 1e6, beyond every prediction.
+    along the ray is linear from 0 to `farthest`. The unit, of ray moments too, is Long-LRM's, the
+    largest coordinate of an input camera, which is 1/sqrt(3) to 1 in a normalized scene
+    (`asysplat.data.normalize`: the farthest camera is at distance 1). It renders with a near plane
+    at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond every prediction.
 
     Args:
         farthest: greatest distance, in that unit.
@@ -192,14 +196,22 @@ class LongLRMHead(GaussianHead):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=0.02)
         self.farthest, self.scale_bias, self.largest = farthest, scale_bias, largest
 
+    def unit(self, views: Views) -> Float[Tensor, "B 1 1 1 1"]:
+        """Compute Long-LRM's unit of length: the largest coordinate of the views' cameras.
+
+        It is at least 1/sqrt(3), the minimum in a normalized scene with different positions.
+        """
+        largest = views.cameras.centers.abs().amax((-2, -1))
+        return largest.clamp_min(3**-0.5)[:, None, None, None, None]
+
     def depth_fraction(
         self, distance: Float[Tensor, "B V h w"], views: Views
     ) -> Float[Tensor, "B V h w"]:
-        return distance / (self.farthest * compute_unit(views)[..., 0])
+        return distance / (self.farthest * self.unit(views)[..., 0])
 
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
         origins, directions = views.cameras.resized(*raw.opacities.shape[2:]).rays()
-        unit = compute_unit(views)
+        unit = self.unit(views)
         sizes = (raw.scales + self.scale_bias).clamp(max=self.largest).exp() * unit
         return Gaussians(
             means=origins + self.farthest * unit * raw.depth_fraction * directions,
@@ -209,15 +221,6 @@ class LongLRMHead(GaussianHead):
             opacities=raw.opacities,
             sh=raw.sh,
         )
-
-
-def compute_unit(views: Views) -> Float[Tensor, "B 1 1 1 1"]:
-    """Compute Long-LRM's unit of length: the largest coordinate of the views' cameras.
-
-    It is at least 1/sqrt(3), the minimum in a normalized scene with different positions.
-    """
-    largest = views.cameras.centers.abs().amax((-2, -1))
-    return largest.clamp_min(3**-0.5)[:, None, None, None, None]
 
 
 def squash(values: Tensor, bound: Tensor | float) -> Tensor:

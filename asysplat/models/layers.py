@@ -62,8 +62,8 @@ class RMSNorm(nn.RMSNorm):
     If weights and inputs differ in type, torch does not use its fused kernel.
     """
 
-    def __init__(self, width: int):
-        super().__init__(width, eps=1e-6)
+    def __init__(self, width: int, eps: float = 1e-6):
+        super().__init__(width, eps)
 
     def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         with without_autocast(x):
@@ -73,11 +73,16 @@ class RMSNorm(nn.RMSNorm):
 PIXEL_CHANNELS = 9
 
 
-def pixel_features(views: Views, prior: Prior | None) -> Float[Tensor, "B V H W c"]:
-    """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel."""
+def pixel_features(
+    views: Views, prior: Prior | None, unit: Float[Tensor, "B 1 1 1 1"] | float
+) -> Float[Tensor, "B V H W c"]:
+    """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel.
+
+    The moment is in units of length `unit`.
+    """
     origins, directions = views.cameras.rays()
     colors = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
-    features = [colors, torch.linalg.cross(origins, directions), directions]
+    features = [colors, torch.linalg.cross(origins / unit, directions), directions]
     if prior is not None:
         features.append(prior.features(views.cameras.height, views.cameras.width))
     return torch.cat(features, dim=-1)

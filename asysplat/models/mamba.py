@@ -19,16 +19,20 @@ class BiMamba2(nn.Module):
     """The letter m: x + out(forward(u) + backward(u)), u = in(RMSNorm(x)), all views one sequence.
 
     Mamba2 (Dao and Gu 2024), in both directions as in Vision Mamba (Zhu et al. 2024).
+
+    Args:
+        state_size: N, numbers of the state of each channel.
+        eps: of its RMSNorms; 1e-5 in Dao and Gu's code, https://github.com/state-spaces/mamba.
     """
 
-    def __init__(self, shape: StageShape, state_size: int = 256):
+    def __init__(self, shape: StageShape, state_size: int = 256, eps: float = 1e-6):
         super().__init__()
         inner = EXPAND * shape.width
         heads = inner // shape.head_dim
-        self.norm = RMSNorm(shape.width)
+        self.norm = RMSNorm(shape.width, eps)
         self.project = nn.Linear(shape.width, 2 * inner + 2 * state_size + heads, bias=False)
         self.directions = nn.ModuleList(
-            Mamba2Direction(inner, heads, state_size, reverse) for reverse in (False, True)
+            Mamba2Direction(inner, heads, state_size, reverse, eps) for reverse in (False, True)
         )
         self.out = nn.Linear(inner, shape.width, bias=False)
 
@@ -41,7 +45,7 @@ class BiMamba2(nn.Module):
 class Mamba2Direction(nn.Module):
     """One direction with its own convolution, scan parameters and gated RMSNorm."""
 
-    def __init__(self, inner: int, heads: int, state_size: int, reverse: bool):
+    def __init__(self, inner: int, heads: int, state_size: int, reverse: bool, eps: float):
         super().__init__()
         self.splits = (inner, inner + 2 * state_size, heads)
         self.state_size, self.reverse = state_size, reverse
@@ -50,7 +54,7 @@ class Mamba2Direction(nn.Module):
         self.A_log = nn.Parameter(torch.empty(heads).uniform_(1, 16).log())
         self.D = nn.Parameter(torch.ones(heads))
         self.dt_bias = nn.Parameter(inverse_softplus(log_uniform(heads, 1e-3, 1e-1)))
-        self.norm = RMSNorm(inner)
+        self.norm = RMSNorm(inner, eps)
 
     def forward(self, u: Float[Tensor, "B L u"]) -> Float[Tensor, "B L inner"]:
         z, xBC, dt = u.split(self.splits, dim=-1)

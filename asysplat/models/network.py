@@ -197,7 +197,8 @@ class TokenNetwork(Network):
         if not (self.training or self.early_exit == EXACT):
             return self.predict_with_early_exit(views)
         prior = self.run_prior(views)
-        return self.head(self.tokens(pixel_features(views, prior)), views, prior)
+        pixels = pixel_features(views, prior, self.head.unit(views))
+        return self.head(self.tokens(pixels), views, prior)
 
     def predict_with_early_exit(self, views: Views) -> Gaussians:
         """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`."""
@@ -218,7 +219,8 @@ class TokenNetwork(Network):
         skipped = self.skippable_layers if skip_layers else ()
         layers = sum(len(m) for m in self.modules() if isinstance(m, Layers))
         self.early_exit_fractions |= {"network": 0.0, "layers": len(skipped) / layers}
-        return self.head(self.tokens(pixel_features(views, prior), skipped), views, prior)
+        pixels = pixel_features(views, prior, self.head.unit(views))
+        return self.head(self.tokens(pixels, skipped), views, prior)
 
     @abstractmethod
     def tokens(

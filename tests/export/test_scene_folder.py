@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
+from asysplat.evaluation.metrics import psnr
 from asysplat.export import write_gaussians
 from asysplat.export.scene_folder import SceneFile, check_visible, find_files
 from asysplat.geometry.motion import transform
+from asysplat.rendering import render
 from asysplat.scene import Gaussians
 
 SCALE = 0.3  # of the other system's units
@@ -97,6 +100,52 @@ def test_cameras_bring_gaussians_to_the_datas_world(file, sequence, world, other
     turns = [torch.nn.functional.normalize(each.quats.double(), dim=-1) for each in (found, world)]
     torch.testing.assert_close((turns[0] * turns[1]).sum(-1).abs(), torch.ones(12).double())
     check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
+
+
+def write_long_lrm(folder, gaussians, motion) -> None:
+    """Gaussians of the data's coordinates as Long-LRM writes them, normalized, in float32."""
+    folder.mkdir(parents=True)
+    write_gaussians(folder / "gaussians_001.ply", transform(gaussians, motion).scale_by(SCALE))
+    np.savetxt(folder / "pos_avg_inv.txt", motion.float().numpy())
+    np.savetxt(folder / "scene_scale.txt", np.array([SCALE]))
+    np.savetxt(folder / "input_frame_idx.txt", np.arange(6), fmt="%i")
+
+
+def test_long_lrms_gaussians_are_brought_to_the_datas_coordinates(sequence, world, other, tmp_path):
+    write_long_lrm(tmp_path / "room", world, other)
+    file = find_files(tmp_path, [sequence])["room"]
+    found, residual = file.read()
+    assert residual is None
+    options = {"cameras": sequence.cameras, "depth": False}
+    images = [render(scene, **options).image for scene in (world, found.to(torch.float32))]
+    target = images[0].clamp(0, 1) * 0.9
+    assert psnr(images[1], images[0]).min() > 80
+    torch.testing.assert_close(psnr(images[1], target), psnr(images[0], target), atol=1e-3, rtol=0)
+    check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
+    (tmp_path / "room" / "pos_avg_inv.txt").unlink()
+    normalized, _ = file.read()
+    assert psnr(render(normalized.to(torch.float32), **options).image, images[0]).max() < 40
+
+
+def test_long_lrms_gaussians_of_a_scene_far_from_the_origin(world, other, tmp_path):
+    origin = torch.tensor([4.0e5, -2.0e5, 300.0], dtype=torch.float64)
+    scene = ProceduralScene(3, 8, 8, num_images=4)
+    write_transforms(scene.views(range(4)), tmp_path / "room")
+    content = json.loads((tmp_path / "room" / "transforms.json").read_text())
+    for frame in content["frames"]:
+        for axis in range(3):
+            frame["transform_matrix"][axis][3] += origin[axis].item()
+    (tmp_path / "room" / "transforms.json").write_text(json.dumps(content))
+    sequence = open_scene(tmp_path / "room", SceneOptions(8, 8))
+    moved = replace(world.to(torch.float64), means=world.means.double() + origin)
+    motion = other.clone()
+    motion[:3, 3] -= motion[:3, :3] @ origin
+    folder = tmp_path / "long_lrm" / "room"
+    write_long_lrm(folder, moved, motion)
+    np.savetxt(folder / "pos_avg_inv.txt", motion.numpy())
+    found, _ = find_files(tmp_path / "long_lrm", [sequence])["room"].read()
+    expected = moved.means - torch.tensor(sequence.scene.origin)
+    torch.testing.assert_close(found.means, expected, atol=1e-4, rtol=0)
 
 
 def test_noisy_cameras_beside_a_scene_have_a_residual(file, sequence, other):

@@ -8,20 +8,23 @@ import pytest
 import torch
 from tiny_runs import finished
 
+from asysplat.training.callbacks.weight_average import TRAINED
+
 FEW = [
     *("trainer.accelerator=cpu", "steps=2", "validate_every=1", "data.batch_size=4"),
     *("data.val_scenes=3", "data.test_scenes=3", "data.test_sets=null"),  # odd, of two processes
-    *("~callbacks.costs", "~callbacks.figures", "~callbacks.progress"),
+    *("~callbacks.costs", "~callbacks.figures", "~callbacks.progress", "ema=0.5"),
 ]
 TWO = "trainer.devices=2"
 
 
 def read_run(result) -> SimpleNamespace:
-    """The curves, the test results and the weights of a run."""
+    """The curves, the test results, the averaged and the last weights of a run."""
     folder = finished(result)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     results = json.loads((folder / "metrics.json").read_text())
-    state = torch.load(checkpoint, weights_only=True)["state_dict"]
+    content = torch.load(checkpoint, weights_only=True)
+    state = {f"{key}/{n}": t for key in ("state_dict", TRAINED) for n, t in content[key].items()}
     state = {name: t for name, t in state.items() if t.is_floating_point()}  # counters are not
     return SimpleNamespace(
         checkpoint=checkpoint,

@@ -1,4 +1,4 @@
-"""Callbacks: metrics, costs, figures, bad scenes, non-finite steps, checkpoints."""
+"""Callbacks: metrics, costs, figures, bad scenes, non-finite steps, averages, checkpoints."""
 
 from asysplat.training.callbacks.checkpoints import Checkpoints, StageRecord
 from asysplat.training.callbacks.costs import Costs
@@ -6,6 +6,7 @@ from asysplat.training.callbacks.figures import Curve, Figures
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
 from asysplat.training.callbacks.skipped import BadScenes, NonFiniteSteps
+from asysplat.training.callbacks.weight_average import WeightAverage, average_weights
 
 __all__ = [
     "BadScenes",
@@ -17,4 +18,6 @@ __all__ = [
     "NonFiniteSteps",
     "StageRecord",
     "TrainingMonitor",
+    "WeightAverage",
+    "average_weights",
 ]

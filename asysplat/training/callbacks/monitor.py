@@ -1,7 +1,11 @@
-"""Log the speed and the memory of a training, its gradients and its Gaussians."""
+"""Log the speed and the memory of a training, its gradients and its Gaussians; watch its loss."""
 
+import math
+import statistics
 import time
+import warnings
 from collections import defaultdict
+from typing import Any
 
 import torch
 from lightning import Callback, Trainer
@@ -14,6 +18,8 @@ from asysplat.training.module import SplattingModule
 from asysplat.training.parallel import Batch, Prediction
 
 MIN_ALPHA = 0.5  # the depth of a pixel with less coverage is not counted
+INTERVALS = 10  # of steps, that the band of the loss is of; it begins with half as many
+MIN_FACTOR, MIN_DEVIATIONS = 2.0, 6.0  # above the median, at least: its multiple, and deviations
 SAMPLES = 10_000  # values of a validation scene in a histogram, at least, if it has as many
 
 
@@ -25,13 +31,23 @@ class TrainingMonitor(Callback):
     - gradient/: the norm of each part of the network, before it is clipped.
     - gaussians/: histograms and medians, over the scenes of the first process, of opacities, of
       scales (the geometric mean of a Gaussian's three) and of rendered depths at the targets.
+
+    Warns when the median loss of `every` steps leaves its `LossBand`.
     """
 
     def __init__(self, every: int = 50):
-        self.every = every
+        self.every, self.band = every, LossBand()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"losses": self.band.losses, "is_outside": self.band.is_outside}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.band.losses = list(state_dict["losses"])
+        self.band.is_outside = state_dict["is_outside"]
 
     def on_train_start(self, *_: object) -> None:
         self.seconds, self.views, self.steps = 0.0, 0, 0
+        self.losses: list[Tensor] = []
         self.since = time.perf_counter()
 
     def on_train_epoch_start(self, *_: object) -> None:
@@ -51,7 +67,10 @@ class TrainingMonitor(Callback):
         self.seconds, self.since = self.seconds + now - self.since, now
         views = batch["inputs"].num_views + batch["targets"].num_views
         self.views += len(batch["scene"]) * views * trainer.world_size
+        if self.steps > len(self.losses):  # the last micro-batch of a step
+            self.losses.append(trainer.callback_metrics["train/loss"])
         if self.steps == self.every:
+            self._watch_loss(trainer)
             values = {
                 "time/views_per_second": self.views / self.seconds,
                 "time/seconds_per_step": self.seconds / self.steps,
@@ -59,6 +78,18 @@ class TrainingMonitor(Callback):
             }
             log_numbers(trainer, values, trainer.global_step - 1)
             self.on_train_start()
+
+    def _watch_loss(self, trainer: Trainer) -> None:
+        losses = torch.stack(self.losses)
+        loss, bound = losses[losses.isfinite()].median().item(), self.band.bound
+        if self.band.leaves(loss) and trainer.is_global_zero:
+            warnings.warn(
+                f"step {trainer.global_step}: the median loss of {self.every} steps is {loss:.3g}, "
+                f"and its band, of the steps before, ends at {bound:.3g}; if it does not fall "
+                "again, stop, and start from earlier weights with a smaller learning_rate: "
+                "init_path=.../checkpoints/best.ckpt, or previous.ckpt.",
+                stacklevel=1,
+            )
 
     def on_validation_epoch_start(self, *_: object) -> None:
         self.samples: dict[str, list[Tensor]] = defaultdict(list)
@@ -85,6 +116,39 @@ class TrainingMonitor(Callback):
             log_numbers(trainer, medians, trainer.global_step)
             for logger in trainer.loggers:
                 log_histogram(logger, f"gaussians/{name}", values, trainer.global_step)
+
+
+class LossBand:
+    """Tells when the median loss of an interval of steps leaves the band of the last INTERVALS.
+
+    The band ends above the median, at MIN_FACTOR times it or at MIN_DEVIATIONS median absolute
+    deviations, whichever is higher: noise, and a task that slowly gets harder, are within. Medians
+    of steps, as a few hard scenes raise a mean.
+    """
+
+    def __init__(self):
+        self.losses: list[float] = []  # of the last intervals
+        self.is_outside = False
+
+    @property
+    def bound(self) -> float:
+        """Upper end of the band; infinite until there are half as many intervals."""
+        if 2 * len(self.losses) < INTERVALS:
+            return math.inf
+        median = statistics.median(self.losses)
+        deviation = statistics.median(abs(loss - median) for loss in self.losses)
+        return max(MIN_FACTOR * median, median + MIN_DEVIATIONS * deviation)
+
+    def leaves(self, loss: float) -> bool:
+        """Add the next interval's loss; return whether it, and not the one before, is outside.
+
+        An interval without a finite loss, NaN, is left out.
+        """
+        if math.isnan(loss):
+            return False
+        was_outside, self.is_outside = self.is_outside, loss > self.bound
+        self.losses = [*self.losses, loss][-INTERVALS:]
+        return self.is_outside and not was_outside
 
 
 def gradient_norms(net: nn.Module) -> dict[str, float]:

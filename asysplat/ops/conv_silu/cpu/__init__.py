@@ -76,6 +76,7 @@ def _view_sequences(tokens: Float[Tensor, "B L C"]) -> Sequences:
 
 
 def _arrange_taps(weight: Tensor, bias: Tensor | None, before: int) -> Taps:
-    bias = weight.new_zeros(len(weight)) if bias is None else bias
-    rows = weight.T.contiguous().numpy()
-    return Taps(tuple(rows), bias.contiguous().numpy(), before)
+    # Copies, as FSDP frees the storage of a weight, which NumPy would keep from being resized.
+    bias = weight.new_zeros(len(weight)) if bias is None else bias.clone()
+    rows = weight.T.clone(memory_format=torch.contiguous_format).numpy()
+    return Taps(tuple(rows), bias.numpy(), before)
