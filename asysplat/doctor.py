@@ -62,6 +62,9 @@ def describe() -> dict[str, str]:
     from asysplat.evaluation.measured_cost import memory_gb
 
     lines["memory"] = f"{memory_gb('cpu'):.0f} GB"
+    if Path("/dev/shm").is_dir():
+        shared = shutil.disk_usage("/dev/shm").free / 1e9
+        lines["/dev/shm"] = f"{shared:.0f} GB free, for what loads data: see train.py's plan"
     lines["torch"] = f"{torch.__version__}, {torch.get_num_threads()} threads"
     lines["kernels"] = ", ".join(
         f"{name} {version(name)}" for name in ("numba", "triton") if find_spec(name)

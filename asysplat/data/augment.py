@@ -94,7 +94,6 @@ def center_crop(views: Views, fraction: float) -> Views:
     rows, columns = max(1, round(fraction * height)), max(1, round(fraction * width))
     if (rows, columns) == (height, width):
         return views
-    views = views.decoded()
     top, left = (height - rows) // 2, (width - columns) // 2
 
     images = views.images[..., top : top + rows, left : left + columns]

@@ -12,7 +12,6 @@ from typing import NotRequired, TypedDict
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 from rich.markup import escape
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Subset
@@ -28,7 +27,7 @@ from asysplat.errors import InputError
 from asysplat.scene import Views
 
 MAX_DRAWS = 10  # scenes drawn for one task, with on_error=skip
-MAX_LOADED_BYTES = 2**30  # size of the images that a set of fixed tasks keeps in memory
+MAX_LOADED_BYTES = 2**30  # size of the images of fixed tasks that a process keeps in memory
 
 
 class Sample(TypedDict):
@@ -75,6 +74,7 @@ class SceneDataModule(lightning.LightningDataModule):
             batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its scenes.
         growth_steps: optimizer steps in which the window of the training tasks grows.
+        prefetch: batches that each of the `num_workers` holds ready.
 
     Raises:
         InputError: a name that no file can have, or a task that cannot be loaded: `setup` tries one
@@ -98,6 +98,7 @@ class SceneDataModule(lightning.LightningDataModule):
     on_error: Policy = "fail"
     micro_batch: int | None = None
     growth_steps: int = 0
+    prefetch: int = 2
 
     def __post_init__(self):
         super().__init__()
@@ -123,10 +124,14 @@ class SceneDataModule(lightning.LightningDataModule):
                     tests[name] = make_tasks()
             validation = self.source.evaluation("val", *counts)
             samples = {"training": TrainingTasks(self)[0]}
-            self.evaluation["val"] = FixedTasks(validation, self.points, "validation")
+            room = MAX_LOADED_BYTES
+            options = {"points": self.points, "process": self._process}
+            self.evaluation["val"] = FixedTasks(validation, "validation", room, **options)
+            room -= self.evaluation["val"].num_bytes
             for name, tasks in tests.items():
                 with self._naming(name):
-                    self.tests[name] = FixedTasks(tasks, self.points, f"test {name}")
+                    self.tests[name] = FixedTasks(tasks, f"test {name}", room, **options)
+                room -= self.tests[name].num_bytes
             self.evaluation["test"] = self.tests[self.name]
             samples |= {name: tasks[0] for name, tasks in self.tests.items()}
             missing = [
@@ -196,7 +201,7 @@ class SceneDataModule(lightning.LightningDataModule):
             batch_size=micro_batch,
             num_workers=self.num_workers,
             collate_fn=collate,
-            prefetch_factor=4 if self.num_workers else None,
+            prefetch_factor=self.prefetch if self.num_workers else None,
             # The platform's default: inside a joblib job the default is joblib's, which cannot
             # start these workers.
             multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
@@ -256,28 +261,37 @@ class TrainingTasks(Dataset):
 
 
 class FixedTasks(Dataset):
-    """Evaluation tasks; the first ones are loaded into memory, up to MAX_LOADED_BYTES."""
+    """Evaluation tasks.
 
-    def __init__(self, tasks: Sequence[Task], points: bool = False, name: str = ""):
-        self.tasks, self.points = tasks, points
-        self._loaded: list[Sample] = []
-        size = 0
-        # Processes side by side would draw over each other; `rank` is set by Lightning.
-        rank = rank_zero_only.rank  # ty: ignore[missing-attribute]
+    The first ones of a process, (rank, processes), are loaded into memory: images of up to `room`
+    bytes, and those of one task more.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        name: str = "",
+        room: int | float = MAX_LOADED_BYTES,
+        points: bool = False,
+        process: tuple[int, int] = (0, 1),
+    ):
+        self.tasks, self.points, self.num_bytes = tasks, points, 0
+        self._loaded: dict[int, Sample] = {}
+        (rank, processes), title = process, escape(f"loading {name}")
+        # Processes side by side would draw over each other.
         alone = rank == 0 and current_process().name == "MainProcess"
-        title = escape(f"loading {name}")
-        for task in track(tasks, title, transient=True, disable=not alone):
-            self._loaded.append(load(task, points=points))
-            size += sum(self._loaded[-1][views].images.nbytes for views in ("inputs", "targets"))
-            if size > MAX_LOADED_BYTES:
+        mine = range(rank, len(tasks), processes)
+        for index in track(mine, title, transient=True, disable=not alone):
+            if self.num_bytes > room:
                 break
+            self._loaded[index] = sample = load(tasks[index], points=points)
+            self.num_bytes += sum(sample[each].images.nbytes for each in ("inputs", "targets"))
 
     def __len__(self) -> int:
         return len(self.tasks)
 
     def __getitem__(self, index: int) -> Sample:
-        known = index < len(self._loaded)
-        sample = self._loaded[index] if known else load(self.tasks[index], points=self.points)
+        sample = self._loaded.get(index) or load(self.tasks[index], points=self.points)
         inputs, targets = sample["inputs"].decoded(), sample["targets"].decoded()
         return {**sample, "inputs": inputs, "targets": targets}
 
@@ -311,13 +325,10 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
 
 
 def collate(samples: list[Sample]) -> Batch:
-    inputs, targets = ([sample[views] for sample in samples] for views in ("inputs", "targets"))
-    if len({views.images.dtype for views in inputs}) > 1:  # of images that augmentation changed
-        inputs, targets = ([v.decoded() for v in views] for views in (inputs, targets))
     return {
         "scene": [sample["scene"] for sample in samples],
-        "inputs": Views.stack(inputs),
-        "targets": Views.stack(targets),
+        "inputs": Views.stack([sample["inputs"] for sample in samples]),
+        "targets": Views.stack([sample["targets"] for sample in samples]),
         "prune": all(sample.get("prune", True) for sample in samples),
         "bad_scenes": [error for sample in samples for error in sample.get("bad_scenes", ())],
     }

@@ -43,7 +43,7 @@ NOT_HASHED = (
     *("allow_missing_losses", "training.loss.allow_missing"),
     *("data.root", "data.index", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
-    *("trainer.num_sanity_val_steps", "data.micro_batch"),
+    *("trainer.num_sanity_val_steps", "data.micro_batch", "data.prefetch"),
     *("training.checkpoint_layers", "training.compile", "training.views_at_once"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )

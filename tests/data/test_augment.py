@@ -62,6 +62,15 @@ def test_a_crop_takes_the_nearest_depths_and_masks():
     assert torch.equal(bare.images, crop.images)
 
 
+def test_a_crop_of_stored_images_is_stored():
+    views = make_views()
+    stored = replace(views, images=(255 * views.images).round().byte())
+    crop = center_crop(stored, 0.6)
+    assert crop.images.dtype == torch.uint8
+    exact = center_crop(stored.decoded(), 0.6).images
+    assert (crop.decoded().images - exact).abs().max() < 1.01 / 255
+
+
 def test_orders_of_inputs_follow_their_probabilities():
     inputs = [3, 5, 8, 13, 21, 34]
     rng = np.random.default_rng(0)

@@ -146,15 +146,22 @@ def test_an_input_that_is_a_target_is_decoded_once():
     assert torch.equal(sample["targets"].images, images[[2, 3, 0]])
 
 
-def test_fixed_tasks_stay_loaded_up_to_a_limit(monkeypatch):
+def test_fixed_tasks_stay_loaded_up_to_a_limit():
     sequences = [Counting(ProceduralScene(seed, 16, 16, num_images=24)) for seed in range(3)]
     tasks = [Task(sequence, Selection([0, 1], [2])) for sequence in sequences]
-    monkeypatch.setattr(datamodule, "MAX_LOADED_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
-    fixed = FixedTasks(tasks)
+    fixed = FixedTasks(tasks, room=1.5 * 3 * 3 * 16 * 16 * 4)
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 0]
     for _ in range(2):
         assert [sample["scene"] for sample in fixed] == [sequence.name for sequence in sequences]
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 6]
+
+
+def test_a_process_keeps_its_share_of_the_fixed_tasks():
+    sequences = [Counting(ProceduralScene(seed, 16, 16, num_images=24)) for seed in range(3)]
+    tasks = [Task(sequence, Selection([0, 1], [2])) for sequence in sequences]
+    fixed = FixedTasks(tasks, process=(1, 2))
+    assert [len(sequence.decoded) for sequence in sequences] == [0, 3, 0]
+    assert fixed.num_bytes == 3 * 3 * 16 * 16 * 4
 
 
 @pytest.mark.medium

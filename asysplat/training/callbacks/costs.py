@@ -6,8 +6,10 @@ from datetime import timedelta
 
 import torch
 from lightning import Callback, Trainer
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
-from asysplat.data.datamodule import TrainingTasks, collate
+from asysplat.data.datamodule import SceneDataModule, TrainingTasks, collate
 from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest, memory_gb
 from asysplat.evaluation.static_cost import count_parameters, static_costs
@@ -104,11 +106,28 @@ def make_plan(trainer: Trainer, module: SplattingModule) -> str:
             "and data.width, or a larger device."
         )
     time = timedelta(seconds=round(trainer.max_steps * seconds))
+    load_seconds, task_bytes = _try_loading(trainer.datamodule)
+    split = trainer.datamodule.split(trainer.world_size)
+    workers = math.ceil(load_seconds * split.micro_batch * split.accumulated / seconds)
+    held = workers * trainer.datamodule.prefetch * split.micro_batch * task_bytes
     return (
         f"plan: {count_parameters(module.net) / 1e6:.2f}M parameters, {trainer.max_steps:,} steps\n"
         f"  memory: about {needed:.3g} of {capacity:.3g} GB\n"
-        f"  time: {seconds:.3g} s a step, {time} without validation"
+        f"  time: {seconds:.3g} s a step, {time} without validation\n"
+        f"  loading: {load_seconds:.3g} s a task; data.num_workers={workers} of each process keep "
+        f"up, and hold {held / 1e9:.2g} GB in /dev/shm"
     )
+
+
+def _try_loading(data: SceneDataModule) -> tuple[float, int]:
+    """Return the seconds in which one process loads a training task, and the task's bytes."""
+    tasks, meter = TrainingTasks(data), CostMeter(torch.device("cpu"))
+    for index in (1, 2):
+        meter.start()
+        sample = tasks[index]
+        meter.stop()
+    tensors = tree_leaves([vars(sample[views]) for views in ("inputs", "targets")])
+    return min(meter.seconds), sum(t.nbytes for t in tensors if isinstance(t, Tensor))
 
 
 def _try(trainer: Trainer, module: SplattingModule) -> tuple[float, float]:
