@@ -26,7 +26,7 @@ EXTRAS = {
     "mesh": "meshes of scenes",
     "spz": "SPZ of version 4",
     "sweeps": "sweeps on several processes, or on SLURM",
-    "disparity": "python -m asysplat.data.disparity",
+    "disparity": "asysplat prepare --disparities",
     "wandb": "logger=wandb",
 }
 

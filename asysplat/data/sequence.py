@@ -24,10 +24,8 @@ from asysplat.data.images import (
     load_reduced,
     resize_and_crop,
     resized_intrinsics,
-    same_proportions,
     undistort,
 )
-from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 # A scene is moved if its cameras are this far from the origin, in units and in their extent.
@@ -72,7 +70,6 @@ class SceneOptions:
             leaves those images out with a warning, and decodes each image once to find them.
         masks: whether masks are of an object or of what to ignore; see `with_masks`.
         resampling: how photographs and alphas are resized, see `Resampling`.
-        disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
     """
 
     height: int
@@ -81,7 +78,6 @@ class SceneOptions:
     on_error: Policy = "fail"
     masks: MasksOf = "auto"
     resampling: Resampling = "lanczos"
-    disparities: Path | str | None = None
 
 
 @dataclass(frozen=True)
@@ -243,21 +239,7 @@ class FileSequence:
         return self._map(image.depth, load_depth, image.lens) * image.depth_unit
 
     def _disparity(self, image: PosedImage) -> Float[Tensor, "H W"]:
-        lens = image.lens
-
-        def load_disparity(file: ImageFile) -> ndarray:
-            disparity = load_depth(file)
-            height, width = disparity.shape
-            # The image may have been replaced since its disparities were estimated.
-            if not same_proportions((width, height), (lens.width, lens.height)):
-                raise InputError(
-                    f"{file} is {width} x {height} and {image.file} {lens.width} x "
-                    f"{lens.height}: delete it, and estimate it again with python -m "
-                    "asysplat.data.disparity."
-                )
-            return disparity
-
-        return self._map(image.disparity, load_disparity, lens)
+        return self._map(image.disparity, load_depth, image.lens)
 
     def _mask(self, image: PosedImage) -> Bool[Tensor, "H W"]:
         lens = image.lens

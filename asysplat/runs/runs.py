@@ -78,8 +78,8 @@ def hashed_options(
 ) -> dict[str, Any]:
     """Return the resolved options of a run that change its numbers, other than its seed.
 
-    Of the test root, disparities and a checkpoint to start from, only whether they are given is
-    returned. Missing values (`???`) are allowed.
+    Of the test root and a checkpoint to start from, only whether they are given is returned.
+    Missing values (`???`) are allowed.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
@@ -90,8 +90,7 @@ def hashed_options(
         config.seed = config.data.num_workers = config.data.test_sets = None
     resolved = plain_options(config)
     resolved["init_path"] = resolved["init_path"] is not None
-    for key in ("test_root", "disparities"):
-        resolved["data"][key] = resolved["data"].get(key) is not None
+    resolved["data"]["test_root"] = resolved["data"].get("test_root") is not None
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)

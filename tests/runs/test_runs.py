@@ -43,7 +43,7 @@ def write_run(tmp_path):
 
 SAME = [
     *("metrics=default", "seed=5", "logger=none", "name=other", "paths.logs=/b/logs", "rerun=true"),
-    *("data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/", "data.disparities=/b/disparities"),
+    *("data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"),
     *(
         "data.num_workers=3",
         "paths.weights=/b/weights",
@@ -65,7 +65,6 @@ OTHER = {
     "metrics": ["metrics=longlrm"],
     "depth alignment": ["metrics.depth_alignment=median"],
     "weights to start from": ["init_path=/b/last.ckpt"],
-    "without disparities": ["data.disparities=null"],
     "frames instead of scenes": ["data.test_root=null"],
 }
 

@@ -217,8 +217,8 @@ def test_pixels_without_depth_do_not_count(rows):
 @pytest.mark.parametrize(
     ("term", "reason"),
     [
-        (RenderedDisparity, "neither disparities nor depths; python -m"),
-        (InputDisparity, "neither disparities nor depths; python -m"),
+        (RenderedDisparity, "neither disparities nor depths; asysplat p"),
+        (InputDisparity, "neither disparities nor depths; asysplat p"),
         (LogDepth, "no depths; training/depth=rendered takes disparities"),
     ],
 )
@@ -265,7 +265,9 @@ def test_the_ssim_term_is_what_ssim_lacks_of_1():
 
 def test_data_without_depth_is_refused_where_it_is_not_allowed():
     loss = make_loss(mse=1.0, depth=0.01, allow_missing=False)
-    with pytest.raises(InputError, match=r"depth=0.01: .* asysplat.data.disparity estimates"):
+    with pytest.raises(
+        InputError, match=r"depth=0.01: .* asysplat prepare --disparities estimates"
+    ):
         loss(*pair(depths=False))
     # A scene without depths after one that has them does not end a training.
     loss = make_loss(mse=1.0, depth=0.01, allow_missing=False)

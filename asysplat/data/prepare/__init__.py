@@ -20,6 +20,7 @@ from torch import Tensor
 
 from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.images import Resampling, resized_intrinsics
+from asysplat.data.prepare.disparity import load_depth_anything, with_disparities
 from asysplat.data.readers import find_scenes, read_scene
 from asysplat.data.readers.prepared import SUFFIX, StoredTensors
 from asysplat.data.sequence import FileSequence, SceneOptions
@@ -33,13 +34,18 @@ Tensors = dict[str, Shaped[ndarray, "..."]]
 
 @dataclass(frozen=True)
 class Encoding:
-    """How photographs are resized and stored: as JPEG, or as WebP without loss."""
+    """How photographs are resized and stored: as JPEG, or as WebP without loss.
+
+    With the disparities that the network `disparities` estimates, a folder or a name on the Hub.
+    """
 
     resampling: Resampling = "lanczos"
     lossless: bool = False
+    disparities: str | None = None
 
     def __str__(self) -> str:
-        return f"{self.resampling}, {'lossless' if self.lossless else 'JPEG'}"
+        kind = f"{self.resampling}, {'lossless' if self.lossless else 'JPEG'}"
+        return f"{kind}, disparities of {self.disparities}" if self.disparities else kind
 
     @property
     def options(self) -> dict[str, Any]:
@@ -103,6 +109,9 @@ def prepare_scene(scene: Path, preparation: Preparation) -> int | str:
     try:
         with unpacked(scene, preparation.layout) as (layout, path):
             posed = read_scene(layout, path, bad)
+            if encoding.disparities:
+                network = load_depth_anything(encoding.disparities, download=False)
+                posed = with_disparities(posed, network, bad)
             options = [SceneOptions(*size, resampling=encoding.resampling) for size in sizes]
             sequences = [FileSequence(posed, option) for option in options]
             encoded: dict[int, list[dict[str, bytes]]] = {}  # by the index of the image

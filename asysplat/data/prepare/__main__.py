@@ -22,6 +22,7 @@ import torch
 from rich.progress import track
 
 from asysplat.data.prepare import Encoding, Preparation, find_sources, is_whole, prepare_scene
+from asysplat.data.prepare.disparity import MODEL, load_depth_anything
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 from asysplat.files import make_folder
@@ -40,6 +41,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="number of processes")
     parser.add_argument("--lossless", action="store_true", help="WebP in place of JPEG")
     help_of_resampling = "lanczos, bicubic or bilinear, as data.resampling"
+    help_of_disparities = f"estimate them, too; a folder, or a name on the Hub; {MODEL}"
+    parser.add_argument("--disparities", nargs="?", const=MODEL, help=help_of_disparities)
+    parser.add_argument("--download", action="store_true", help="download its missing weights")
     parser.add_argument("--resampling", default="lanczos", help=help_of_resampling)
     parser.add_argument("--layout", default="auto", help="of its files; see data/README.md")
     help_of_on_error = "skip: a scene goes without images that cannot be used"
@@ -61,7 +65,7 @@ def run(options: Namespace) -> int:
     preparation = Preparation(
         options.out,
         sizes,
-        Encoding(options.resampling, options.lossless),
+        Encoding(options.resampling, options.lossless, options.disparities),
         layout,
         options.on_error,
     )
@@ -72,6 +76,8 @@ def run(options: Namespace) -> int:
     chosen = sources[part - 1 :: parts]
     if options.verify:
         drop_damaged([preparation.file(s, size) for s in chosen for size in preparation.sizes])
+    if options.disparities:
+        load_depth_anything(options.disparities, options.download)
     todo = [source for source in chosen if preparation.missing(source)]
     written, bad = 0, []
     for source, result in prepare_all(todo, preparation, options.workers):

@@ -18,7 +18,6 @@ from types import ModuleType
 
 from asysplat.data import frames
 from asysplat.data.bad_images import BadImages
-from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
     blender,
     colmap,
@@ -129,8 +128,6 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
         path = scenes[0]
     bad = BadImages(options.on_error)
     posed = read_scene(layout, path, bad, options.masks, (options.height, options.width))
-    if options.disparities is not None:
-        posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)
     if options.on_error == "skip":
         sequence = sequence.without_damaged(bad)

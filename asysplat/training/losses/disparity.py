@@ -2,7 +2,7 @@
 
 The paper's "predicted disparity" is either rendered at the target views, or computed from the
 Gaussians in the input views they are aligned with. The reference is the disparity of a monocular
-network if the data has it (`python -m asysplat.data.disparity`), else the inverse of the depths.
+network if the data has it (`asysplat prepare --disparities`), else the inverse of the depths.
 """
 
 import math
@@ -20,12 +20,12 @@ MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEVIATION = 0.1  # of the median disparity
 MIN_DEPTH = 1e-2  # depths are clamped to it, as in Long-LRM
 NO_DISPARITIES = (
-    "the data has neither disparities nor depths; python -m asysplat.data.disparity estimates "
+    "the data has neither disparities nor depths; asysplat prepare --disparities estimates "
     "disparities"
 )
 NO_DEPTHS = (
     "the data has no depths; training/depth=rendered takes disparities, which "
-    "python -m asysplat.data.disparity estimates"
+    "asysplat prepare --disparities estimates"
 )
 
 
