@@ -27,7 +27,7 @@ from asysplat.errors import InputError
 from asysplat.scene import Views
 
 MAX_DRAWS = 10  # scenes drawn for one task, with on_error=skip
-MAX_LOADED_BYTES = 2**30  # size of the images of fixed tasks that a process keeps in memory
+MAX_LOADED_BYTES = 2**28  # size of the images of fixed tasks that a process keeps in memory
 
 
 class Sample(TypedDict):

@@ -1,6 +1,6 @@
 """Prepare scenes for training: one file a scene and size, with photographs as they will be used.
 
-asysplat prepare DL3DV-ALL-960P prepared --sizes 256,512,540x960
+asysplat prepare DL3DV-ALL-960P prepared --sizes 256,512,544x960
 python train.py data=dl3dv data.root=prepared ...
 
 Scenes are folders, or zip files of one scene each. Finished ones are kept: the same command goes on
@@ -35,7 +35,7 @@ def main(words: list[str] | None = None) -> int:
     parser = ArgumentParser(prog="asysplat prepare", description=__doc__)
     parser.add_argument("root", type=Path, help="a scene, or a folder of scenes")
     parser.add_argument("out", type=Path, help="folder of OUT/256x256/SCENE.safetensors")
-    help_of_sizes = "sides of squares, or heights x widths: 256,512,540x960"
+    help_of_sizes = "sides of squares, or heights x widths: 256,512,544x960"
     parser.add_argument("--sizes", required=True, help=help_of_sizes)
     parser.add_argument("--part", default="1/1", help="3/64: every 64th scene, from the third on")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="number of processes")
@@ -109,7 +109,7 @@ def read_sizes(text: str) -> list[tuple[int, int]]:
     for size in text.split(","):
         match = re.fullmatch(r"([1-9][0-9]*)(?:x([1-9][0-9]*))?", size)
         if match is None:
-            raise InputError(f"--sizes has {size!r}: expected sizes such as 256,512,540x960.")
+            raise InputError(f"--sizes has {size!r}: expected sizes such as 256,512,544x960.")
         height, width = match.groups()
         sizes.append((int(height), int(width or height)))
     return sizes

@@ -16,9 +16,9 @@ import os
 import re
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from io import FileIO
 from itertools import pairwise
 from pathlib import Path
+from weakref import finalize
 
 import numpy as np
 from numpy import ndarray
@@ -137,15 +137,20 @@ def _files(scene: Path) -> list[Path]:
 
 
 def _read(file: Path, start: int, size: int) -> bytes:
-    stored = os.pread(_opened(file).fileno(), size, start)
+    stored = os.pread(_opened(file).descriptor, size, start)
     if len(stored) < size:
         raise InputError(f"{file} ends too early: write it again with asysplat prepare --verify.")
     return stored
 
 
+class _OpenFile:
+    def __init__(self, file: Path):
+        self.descriptor = os.open(file, os.O_RDONLY)
+        finalize(self, os.close, self.descriptor)
+        if hasattr(os, "posix_fadvise"):  # so that the system does not read ahead
+            os.posix_fadvise(self.descriptor, 0, 0, os.POSIX_FADV_RANDOM)
+
+
 @lru_cache(maxsize=16)
-def _opened(file: Path) -> FileIO:
-    opened = FileIO(file)
-    if hasattr(os, "posix_fadvise"):  # so that the system does not read ahead
-        os.posix_fadvise(opened.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
-    return opened
+def _opened(file: Path) -> _OpenFile:
+    return _OpenFile(file)

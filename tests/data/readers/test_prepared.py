@@ -156,7 +156,7 @@ def test_bad_scenes_are_listed_and_the_others_written(prepare, folder, tmp_path)
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["--sizes", "0"], "--sizes has '0': expected sizes such as 256,512,540x960."),
+        (["--sizes", "0"], "--sizes has '0': expected sizes such as 256,512,544x960."),
         (["--part", "3/2"], "--part is 3/2: expected K/N with K from 1 to N, such as 3/64."),
     ],
 )
