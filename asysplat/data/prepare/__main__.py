@@ -17,10 +17,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import get_args
 
 import torch
 from rich.progress import track
 
+from asysplat.data.images import Resampling
 from asysplat.data.prepare import Encoding, Preparation, find_sources, is_whole, prepare_scene
 from asysplat.data.prepare.disparity import MODEL, load_depth_anything
 from asysplat.data.write import refuse_inside
@@ -40,14 +42,16 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--part", default="1/1", help="3/64: every 64th scene, from the third on")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="number of processes")
     parser.add_argument("--lossless", action="store_true", help="WebP in place of JPEG")
-    help_of_resampling = "lanczos, bicubic or bilinear, as data.resampling"
     help_of_disparities = f"estimate them, too; a folder, or a name on the Hub; {MODEL}"
     parser.add_argument("--disparities", nargs="?", const=MODEL, help=help_of_disparities)
     parser.add_argument("--download", action="store_true", help="download its missing weights")
-    parser.add_argument("--resampling", default="lanczos", help=help_of_resampling)
+    methods = get_args(Resampling)
+    parser.add_argument("--resampling", default=methods[0], choices=methods, help="as in training")
     parser.add_argument("--layout", default="auto", help="of its files; see data/README.md")
     help_of_on_error = "skip: a scene goes without images that cannot be used"
-    parser.add_argument("--on-error", default="fail", help=help_of_on_error)
+    parser.add_argument(
+        "--on-error", default="fail", choices=("fail", "skip"), help=help_of_on_error
+    )
     parser.add_argument("--verify", action="store_true", help="write damaged files again")
     try:
         return run(parser.parse_args(words))

@@ -35,9 +35,11 @@ DTYPES = {"F64": np.float64, "F32": np.float32, "I64": np.int64, "U8": np.uint8}
 
 def find_scenes(root: Path) -> list[Path]:
     """Find the scenes of a prepared folder, as root/scene without their sizes; or one of them."""
-    names = {name for folder in size_folders(root) for name in os.listdir(folder)}
-    scenes = [root / name.removesuffix(SUFFIX) for name in sorted(names) if name.endswith(SUFFIX)]
-    return scenes or [root] * bool(_files(root))
+    if not root.is_dir():
+        return [root] * bool(_files(root))
+    files = {file for folder in size_folders(root) for file in os.listdir(folder)}
+    names = sorted(file.removesuffix(SUFFIX) for file in files if file.endswith(SUFFIX))
+    return [root / name for name in names if not name.startswith(".")]  # as of unfinished files
 
 
 def read_scene(scene: Path, bad: BadImages, size: tuple[int, int] | None = None) -> PosedScene:
@@ -110,9 +112,9 @@ class StoredTensors:
         begin = self._begin + self.entries[kind]["data_offsets"][0]
         ends = [0, *self[f"{kind}_ends"].tolist()]
         return [
-            EncodedImage(f"{self.file}, {kind} {i}", partial(_read, self.file, begin + start, size))
-            if (size := end - start)
-            else None
+            EncodedImage(
+                f"{self.file}, {kind} {i}", partial(_read, self.file, begin + start, end - start)
+            )
             for i, (start, end) in enumerate(pairwise(ends))
         ]
 
