@@ -206,12 +206,13 @@ def test_a_run_stopped_twice_in_its_second_stage_has_the_same_bits(train, whole,
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_processes_of_torchrun_train_in_one_folder_and_resume_there(logs, repository):
-    """The second starts two seconds after the first; where one is killed, both go on later."""
+def test_processes_of_torchrun_train_in_one_folder_and_resume_there(logs, train, repository):
+    """They start two seconds apart; where one is killed, all go on later; as one process trains."""
+    sizes = ["data.batch_size=4", "data.val_scenes=2", "data.test_scenes=2"]
     options = [*TINY, f"paths.logs={logs}", "trainer=ddp", "trainer.accelerator=cpu"]
-    options += ["trainer.devices=2", "data.batch_size=2", "data.val_scenes=2", "data.test_scenes=2"]
+    options += ["trainer.devices=4", *sizes]
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    launcher += ["--nproc-per-node=2", "tests/late.py", "train.py", *options]
+    launcher += ["--nproc-per-node=4", "tests/late.py", "train.py", *options]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def launch(name, *more):
@@ -232,3 +233,8 @@ def test_processes_of_torchrun_train_in_one_folder_and_resume_there(logs, reposi
     for name in ("stage1", "stage2", "."):
         found, expected = (saved_in(at / name)["state_dict"] for at in (resumed, whole))
         assert all(torch.equal(found[key], expected[key]) for key in expected)
+    alone = finished(train("name=alone", *sizes))
+    ours, one = (json.loads((at / "metrics.json").read_text()) for at in (whole, alone))
+    for prefix in PREFIXES:
+        key = f"{prefix}test/procedural/psnr"
+        assert abs(ours[key] - one[key]) < 1e-3

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 
 from asysplat import open_photographs, render
 from asysplat.data import FilesSource, SceneOptions
-from asysplat.data.datamodule import collate, load
+from asysplat.data.datamodule import FixedTasks, collate
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import mean_color_images, nearest_view_images, psnr
 from asysplat.runs.checkpoints import load_weights
@@ -56,7 +56,7 @@ def test_real_photographs_are_better_than_the_baselines(module, shared, most):
         distances = []
         for size, views in itertools.product((128, 256), (n for n in numbers if n <= most)):
             source = FilesSource(str(folder), SceneOptions(size, size), window=(24, 96))
-            batch = collate([load(task) for task in source.evaluation("test", views, TARGETS)])
+            batch = collate([*FixedTasks(source.evaluation("test", views, TARGETS))])
             model, nearest, mean = measure(module, lpips, batch)
             cells = " | ".join(f"{p:.2f} / {d:.3f}" for p, d in (model, nearest, mean))
             print(f"| {scene}, {views} views of {size}x{size} | {cells} |")
