@@ -43,7 +43,7 @@ def out(tmp_path, monkeypatch):
                 monkeypatch.setattr(module, "load_depth_anything", lambda *_, **__: estimate)
         words = [str(scene), str(tmp_path / "out"), "--sizes", "24x32", "--workers", "1"]
         assert command.main([*words, "--disparities", *options]) == 0
-        return tmp_path / "out" / scene.name
+        return tmp_path / "out" / "24x32" / f"{scene.name}.safetensors"
 
     return run
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Shaped, UInt16
 from numpy import ndarray
 from PIL import Image
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 from torch import Tensor
 
 from asysplat.data.bad_images import BadImages, Policy
@@ -130,7 +130,7 @@ def prepare_scene(scene: Path, preparation: Preparation) -> int | str:
             tensors["points"] = points
         with atomic_write(file) as partial:
             notes = {"encoding": str(encoding), "hash": content_hash(tensors)}
-            save_file(tensors, partial, notes)
+            partial.write_bytes(save(tensors, notes))  # readable for others, as save_file's is not
     return len(encoded)
 
 

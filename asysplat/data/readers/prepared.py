@@ -34,9 +34,9 @@ DTYPES = {"F64": np.float64, "F32": np.float32, "I64": np.int64, "U8": np.uint8}
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Find the scenes of a prepared folder, as root/scene without their sizes; or one of them."""
-    if not root.is_dir():
-        return [root] * bool(_files(root))
+    """Find the scenes of a prepared folder, as root/scene without their sizes; or a file's."""
+    if root.suffix == SUFFIX and SIZE.fullmatch(root.parent.name) and root.is_file():
+        return [root.parents[1] / root.stem]
     files = {file for folder in size_folders(root) for file in os.listdir(folder)}
     names = sorted(file.removesuffix(SUFFIX) for file in files if file.endswith(SUFFIX))
     return [root / name for name in names if not name.startswith(".")]  # as of unfinished files
