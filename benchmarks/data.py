@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from asysplat.data import ProceduralScene, files_data
-from asysplat.data.prepare import Encoding, Preparation, find_sources
 from asysplat.data.prepare.__main__ import prepare_all
+from asysplat.data.prepare.scene_files import Encoding, Preparation, find_sources
 from asysplat.data.readers.common import opencv_from_opengl
 from asysplat.data.readers.prepared import read_file
 from benchmarks.compare import RATE, TIME, TrackedMetrics

@@ -297,7 +297,7 @@ class FixedTasks(Dataset):
 
 
 def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
-    """Read a task's views, validate, crop by `center_crop`, and normalize them.
+    """Read a task's views, with images as stored, validate, crop and normalize them.
 
     With `points`, the inputs have the depths of the sequence's sparse points, if it has any. The
     sample's `frame` is the Normalization.

@@ -22,7 +22,7 @@ class BiMamba2(nn.Module):
 
     Args:
         state_size: N, numbers of the state of each channel.
-        eps: of its RMSNorms; 1e-5 in Dao and Gu's code, https://github.com/state-spaces/mamba.
+        eps: epsilon of its RMSNorms; 1e-5 in Dao and Gu's code, https://github.com/state-spaces/mamba.
     """
 
     def __init__(self, shape: StageShape, state_size: int = 256, eps: float = 1e-6):

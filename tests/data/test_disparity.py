@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat.data import ProceduralScene, SceneOptions, files_data, open_scene, prepare
+from asysplat.data import ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.data.prepare import __main__ as command
+from asysplat.data.prepare import scene_files
 from asysplat.data.prepare.disparity import LEVELS, DepthAnything, network_size, shrink
 from asysplat.data.write import write_transforms
 from asysplat.training.losses.disparity import reference_disparities
@@ -39,10 +40,11 @@ def out(tmp_path, monkeypatch):
 
     def run(scene, *options, estimate=red):
         if estimate is not None:
-            for module in (command, prepare):
+            for module in (command, scene_files):
                 monkeypatch.setattr(module, "load_depth_anything", lambda *_, **__: estimate)
         words = [str(scene), str(tmp_path / "out"), "--sizes", "24x32", "--workers", "1"]
-        assert command.main([*words, "--disparities", *options]) == 0
+        arguments = command.read_arguments([*words, "--disparities", *options])
+        assert command.main(arguments) == 0
         return tmp_path / "out" / "24x32" / f"{scene.name}.safetensors"
 
     return run

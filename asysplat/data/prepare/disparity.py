@@ -3,14 +3,14 @@
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
 from torch import nn
@@ -23,6 +23,7 @@ from asysplat.errors import InputError
 MODEL = "LiheYoung/depth-anything-small-hf"  # the weights that Long-LRM trains with; Apache-2.0
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # statistics of ImageNet, RGB
 SHORT_SIDE = 518  # pixels of the shorter side in the network's training
+PNG = {"format": "PNG"}
 BATCH = 16  # photographs of one size
 MAX_SHORT_SIDE = 272  # pixels of a map: the loss compares every second pixel of 544
 LEVELS = 4095  # levels of a map: finer than any network's precision, and PNG packs 12 bits well
@@ -51,7 +52,7 @@ def with_disparities(scene: PosedScene, estimate: Estimate, bad: BadImages) -> P
             disparities = estimate(np.stack([pixels for _, pixels in same]))
             for (file, _), disparity in zip(same, disparities, strict=True):
                 stored = encode_map(shrink(disparity, *size))
-                maps[file] = EncodedImage(f"disparity of {file}", BytesIO(stored).getvalue)
+                maps[file] = EncodedImage(f"disparity of {file}", partial(bytes, stored))
         for image in chunk:
             if image.file in maps or image.lens.model == PANORAMA:
                 estimated.append(replace(image, disparity=maps.get(image.file)))
@@ -74,9 +75,13 @@ def encode_map(disparity: Float32[ndarray, "h w"]) -> bytes:
         raise InputError("--disparities gives NaN or infinity: name another model.")
     low, high = float(disparity.min()), float(disparity.max())
     fraction = (disparity - low) / max(high - low, np.finfo(np.float32).tiny)
+    return image_bytes((1 + np.round(fraction * (LEVELS - 1))).astype(np.uint16), **PNG)
+
+
+def image_bytes(pixels: Shaped[ndarray, "h w *channels"], **options: Any) -> bytes:
+    """Encode an image with Pillow's options."""
     stream = BytesIO()
-    levels = (1 + np.round(fraction * (LEVELS - 1))).astype(np.uint16)
-    Image.fromarray(levels).save(stream, "PNG")
+    Image.fromarray(pixels).save(stream, **options)
     return stream.getvalue()
 
 

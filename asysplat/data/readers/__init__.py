@@ -112,7 +112,7 @@ def read_scene(
     Errors of single images are collected. `size`, height and width, chooses a prepared file.
     """
     with file_errors(scene):
-        if layout == "prepared":  # with masks, and faces
+        if layout == "prepared":  # its masks and faces are known
             return prepared.read_scene(scene, bad, size)
         return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad, masks), bad)
 

@@ -39,7 +39,7 @@ def find_scenes(root: Path) -> list[Path]:
         return [root.parents[1] / root.stem]
     files = {file for folder in size_folders(root) for file in os.listdir(folder)}
     names = sorted(file.removesuffix(SUFFIX) for file in files if file.endswith(SUFFIX))
-    return [root / name for name in names if not name.startswith(".")]  # as of unfinished files
+    return [root / name for name in names if not name.startswith(".")]  # unfinished files
 
 
 def read_scene(scene: Path, bad: BadImages, size: tuple[int, int] | None = None) -> PosedScene:

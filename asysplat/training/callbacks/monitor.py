@@ -18,7 +18,7 @@ from asysplat.training.module import SplattingModule
 from asysplat.training.parallel import Batch, Prediction
 
 MIN_ALPHA = 0.5  # the depth of a pixel with less coverage is not counted
-INTERVALS = 10  # of steps, that the band of the loss is of; it begins with half as many
+INTERVALS = 10  # intervals that the band of the loss is made of; it begins with half as many
 MIN_FACTOR, MIN_DEVIATIONS = 2.0, 6.0  # above the median, at least: its multiple, and deviations
 SAMPLES = 10_000  # values of a validation scene in a histogram, at least, if it has as many
 
@@ -127,7 +127,7 @@ class LossBand:
     """
 
     def __init__(self):
-        self.losses: list[float] = []  # of the last intervals
+        self.losses: list[float] = []  # medians of the last intervals
         self.is_outside = False
 
     @property

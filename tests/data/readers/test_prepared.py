@@ -14,7 +14,7 @@ from safetensors.numpy import load
 
 from asysplat.data import SceneOptions, files_data, open_scene
 from asysplat.data.datamodule import TrainingTasks
-from asysplat.data.prepare.__main__ import main
+from asysplat.data.prepare.__main__ import main, read_arguments
 from asysplat.data.write import write_transforms
 
 SIZES = [(12, 16), (16, 16), (24, 32)]
@@ -26,7 +26,7 @@ def prepare(capsys):
 
     def run(root, out, *options, sizes="12x16,16,24x32"):
         words = [str(root), str(out), "--sizes", sizes, "--workers", "1", *options]
-        return main(words), "".join(capsys.readouterr())
+        return main(read_arguments(words)), "".join(capsys.readouterr())
 
     return run
 
@@ -165,8 +165,11 @@ def test_bad_scenes_are_listed_and_the_others_written(prepare, folder, tmp_path)
         (["--part", "3/2"], "--part is 3/2: expected K/N with K from 1 to N, such as 3/64."),
     ],
 )
-def test_an_option_that_cannot_be_is_a_sentence(prepare, folder, tmp_path, options, message):
-    assert prepare(folder("data", 0), tmp_path / "out", *options) == (2, f"error: {message}\n")
+def test_an_option_that_cannot_be_is_a_sentence(folder, tmp_path, capsys, options, message):
+    words = [folder("data", 0), str(tmp_path / "out"), "--sizes", "16", *options]
+    with pytest.raises(SystemExit, match="2"):
+        read_arguments(words)
+    assert capsys.readouterr().err == f"error: {message}\n"
     assert not (tmp_path / "out").exists()
 
 
