@@ -1,7 +1,9 @@
 """Which batches a process loads, and how its workers begin and end."""
 
+import atexit
 import signal
 from dataclasses import dataclass
+from multiprocessing import active_children
 from typing import Any
 
 import lightning
@@ -67,3 +69,11 @@ def batches_done(trainer: lightning.Trainer) -> int:
 def ignore_first_sigterm(_: int) -> None:
     """Ignore the first SIGTERM, which a scheduler also sends to the loaders of a run that saves."""
     signal.signal(signal.SIGTERM, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL))
+
+
+@atexit.register
+def kill_loaders() -> None:
+    """Kill workers that a failed run left: Python sends them one SIGTERM, and waits."""
+    for process in active_children():
+        if process.daemon:
+            process.kill()

@@ -1,5 +1,8 @@
 """A global batch divides evenly among processes, or is refused."""
 
+import subprocess
+import sys
+
 import pytest
 
 from asysplat.data.loader import split_batch
@@ -25,3 +28,16 @@ def test_processes_that_do_not_divide_a_batch_are_refused():
         split_batch(3, None, 2)
     with pytest.raises(InputError, match=r"or set data\.batch_size=8\."):
         split_batch(4, None, 8)
+
+
+LEFT = """
+from torch.utils.data import DataLoader
+from asysplat.data.loader import ignore_first_sigterm
+iterator = iter(DataLoader(range(9), num_workers=1, worker_init_fn=ignore_first_sigterm))
+next(iterator)
+"""
+
+
+@pytest.mark.medium
+def test_a_program_ends_with_its_loaders():
+    subprocess.run([sys.executable, "-c", LEFT], check=True, timeout=60)
