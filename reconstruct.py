@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: idle threads must not spin
 
@@ -30,6 +30,8 @@ if __name__ == "__main__":
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from jaxtyping import Float
+from torch import Tensor
 
 from asysplat import load
 from asysplat.data.cameras import CameraOptions
@@ -50,11 +52,14 @@ from asysplat.refinement import (
     refine_scaffold,
     with_options,
 )
+from asysplat.refinement.exposure import even_exposures, find_exposures
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
 from asysplat.runs.machine import find_device
 from asysplat.scene import Gaussians
 from asysplat.terminal import make_console
+
+RANGES = {"last_fit": Fraction, "exposure": Literal["auto", "given"]}
 
 
 @command("reconstruct")
@@ -66,7 +71,7 @@ def reconstruct(config: DictConfig) -> None:
     if OmegaConf.is_missing(config, "path"):
         raise InputError(f"no photographs: {typed('reconstruct')} my_scene, a folder.")
     check_training(OmegaConf.masked_copy(config, "speed"))
-    check_options({"last_fit": config.last_fit}, {"last_fit": Fraction})
+    check_options({name: config[name] for name in RANGES}, RANGES)
     device = find_device(config.device)
     config = for_device(config, device, given_options())
     limit = read_limit(config)
@@ -92,24 +97,31 @@ def reconstruct(config: DictConfig) -> None:
     find_views(config.video, photographs.input_files, photographs.held_out_files)
     print(describe(config, photographs, limit))
     photographs = photographs.to(device)
-    gaussians = initialize(config, photographs, settings)
+    exposures = find_exposures(photographs.inputs) if config.exposure == "auto" else None
+    fitted = photographs
+    if exposures is not None:
+        most = (exposures.mean(-1).max() - exposures.mean(-1).min()).exp().item()
+        print(f"exposure: some photographs are {most:.1f} times as bright as others (exposure=)")
+        fitted = replace(photographs, inputs=even_exposures(photographs.inputs, exposures))
+    gaussians = initialize(config, fitted, settings)
     background = photographs.background
-    results.save_start(gaussians, photographs, background)
+    results.save_start(gaussians, photographs, background, exposures)
     viewer = Viewer(photographs.inputs, background=background.tolist()) if config.view else None
     with RefinementDisplay(viewer) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}
         if per_view:
-            anchors = refine_scaffold(gaussians, photographs.inputs, settings, **options)
+            anchors = refine_scaffold(gaussians, fitted.inputs, settings, **options)
             results.save(anchors, display.last)
             results.save_video(anchors)
             return
-        gaussians = refine(gaussians, photographs.inputs, settings, **options)
+        gaussians = refine(gaussians, fitted.inputs, settings, **options)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
         fits_all = photographs.held_out is not None and not photographs.is_split
         if config.last_fit and fits_all and not display.stopped:
-            gaussians = fit_to_all(gaussians, photographs, settings, config.last_fit, options)
+            left = config.last_fit, options
+            gaussians = fit_to_all(gaussians, photographs, exposures, settings, *left)
             results.save_scene(gaussians)
         results.save_video(gaussians)
         display.show(gaussians)
@@ -160,12 +172,16 @@ def describe(config: DictConfig, photographs: Photographs, limit: dict[str, floa
 def fit_to_all(
     gaussians: Gaussians,
     photographs: Photographs,
+    exposures: Float[Tensor, "V 3"] | None,
     settings: RefinementSettings,
     fraction: float,
     options: dict[str, Any],
 ) -> Gaussians:
     """Refine Gaussians on all photographs for a fraction of the limit, without new Gaussians."""
     views = photographs.all_views()
+    every = None if exposures is None else find_exposures(views)
+    if exposures is not None and every is not None:
+        views = even_exposures(views, every - every[: len(exposures)].mean(0))  # as the inputs were
     print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
     settings = replace(
         settings, half_resolution_until=0.0, densify="none", every=None, cool_down=1.0

@@ -133,6 +133,9 @@ def test_the_result_folder_has_every_file_and_beats_the_baselines(first, photogr
         error, close = (numbers[f"held_out/{depth}{name}"] for name in ("absrel", "delta1"))
         assert error < 0.6 * numbers["baseline/mean_inverse_depth/absrel"]
         assert close > numbers["baseline/mean_inverse_depth/delta1"]
+    assert 0.5 < numbers["held_out/seen/share"] < 1
+    for part in ("seen", "fitted"):  # what no input shows, and other exposures, are not to blame
+        assert numbers["held_out/psnr"] < numbers[f"held_out/{part}/psnr"]
     assert "mean inverse depth" in said
     assert numbers["steps"] == 60 and numbers["gaussians"] <= 3000
     rows = rows_of(folder)

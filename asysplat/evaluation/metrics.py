@@ -50,6 +50,23 @@ def psnr(rendered: Images, target: Images, masks: Masks | None = None) -> PerVie
     return -10 * mse.clamp_min(MSE_FLOOR).log10()
 
 
+def fit_exposure(rendered: Images, target: Images, masks: Masks | None = None) -> Images:
+    """Apply to each channel of each image the gain and offset that bring it nearest to its target.
+
+    Only pixels in masks count; a channel without contrast becomes its target's mean.
+    """
+    x, y = rendered.double(), target.double()
+    weight = torch.ones_like(x[..., :1, :, :]) if masks is None else masks[..., None, :, :].to(x)
+    total = weight.sum((-2, -1), keepdim=True).clamp_min(1)
+
+    def mean(values: Tensor) -> Tensor:
+        return (weight * values).sum((-2, -1), keepdim=True) / total
+
+    mean_x, mean_y = mean(x), mean(y)
+    variance, covariance = mean((x - mean_x) ** 2), mean((x - mean_x) * (y - mean_y))
+    return ((x - mean_x) * (covariance / variance.clamp_min(1e-12)) + mean_y).to(rendered)
+
+
 def ssim(
     rendered: Images, target: Images, window: Window = "gaussian", covariance: Covariance = "biased"
 ) -> PerView:

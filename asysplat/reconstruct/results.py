@@ -5,6 +5,7 @@ import os
 import tempfile
 import webbrowser
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +21,8 @@ from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.metrics import METRICS, average, write_csv
+from asysplat.evaluation.metrics import METRICS, average, fit_exposure, write_csv
+from asysplat.evaluation.seen import seen_by_inputs
 from asysplat.export import write_gaussians, write_page, write_video
 from asysplat.export.gaussians import CAMERAS, NO_NOTES, WRITERS, Notes
 from asysplat.export.mesh import MESHES, check_mesh_packages, write_mesh
@@ -28,6 +30,7 @@ from asysplat.export.page import PAGE
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, object_center, video_cameras
 from asysplat.refinement import AnchorScene, RefinementProgress
+from asysplat.refinement.exposure import expose, predict_exposures
 from asysplat.rendering import Rendering, render
 from asysplat.runs.runs import PICTURE, SCENE
 from asysplat.runs.summary import (
@@ -71,16 +74,28 @@ class Results:
             print(f"LPIPS is {self._protocol.without_lpips()}.")
 
     def save_start(
-        self, gaussians: Gaussians, photographs: Photographs, background: Float[Tensor, "3"]
+        self,
+        gaussians: Gaussians,
+        photographs: Photographs,
+        background: Float[Tensor, "3"],
+        exposures: Float[Tensor, "V 3"] | None = None,
     ) -> None:
         """Create the folder and write start.png: renderings before the refinement.
 
-        Photographs and background are kept.
+        Photographs and background are kept, and the `exposures` of the inputs, see
+        `find_exposures`: renderings are compared with photographs under these and, for held-out
+        ones, under those that the inputs around them predict.
         """
         cameras = photographs.inputs.cameras
         self._protocol.check_size(cameras.height, cameras.width)
         self.folder = new_folder(self.folder)
         self._photographs, self._background = photographs, background
+        self._exposures = dict.fromkeys(("inputs", "held_out"))
+        if exposures is not None:
+            self._exposures["inputs"] = exposures
+            if photographs.held_out is not None:
+                cameras = photographs.inputs.cameras, photographs.held_out.cameras
+                self._exposures["held_out"] = predict_exposures(exposures, *cameras)
         if self._lpips is not None:
             self._lpips.to(background.device)
         self._save_contact_sheet("start.png", gaussians)
@@ -167,8 +182,10 @@ class Results:
         sets = {"inputs": (inputs, photographs.input_files)}
         if held_out is not None:
             sets["held_out"] = (held_out, photographs.held_out_files)
+        seen_from = None
         for name, (views, files) in sets.items():
-            numbers = self._measure(scene, views)
+            numbers, depths = self._measure(scene, views, self._exposures[name], seen_from)
+            seen_from = depths, views.cameras  # of the inputs, which come first
             results |= _means(name, numbers)
             labels = ({"set": name, "file": file} for file in files)
             rows += [label | row for label, row in zip(labels, numbers, strict=True)]
@@ -181,28 +198,54 @@ class Results:
         _print_table(results)
 
     @torch.no_grad()
-    def _measure(self, scene: Gaussians | AnchorScene, views: Views) -> list[dict[str, float]]:
-        """Compute the metrics of [V] views, which are rendered one by one to save memory."""
-        rows = []
+    def _measure(
+        self,
+        scene: Gaussians | AnchorScene,
+        views: Views,
+        exposures: Float[Tensor, "V 3"] | None,
+        seen_from: tuple[Float[Tensor, "W h w"], Cameras] | None,
+    ) -> tuple[list[dict[str, float]], Float[Tensor, "V h w"]]:
+        """Compute the metrics and depths of [V] views, rendered one by one to save memory.
+
+        Beside the metrics are the PSNR with a gain and an offset fitted to each image and, given
+        the depths and cameras of other views, that of the pixels that these see, and their share.
+        """
+        rows, depths = [], []
+        of_pixels = replace(self._protocol, psnr_over="masks")
         for view in range(views.num_views):
             target = views.select([view])
             seen = scene if isinstance(scene, Gaussians) else scene.decode(target.cameras).gaussians
             draw = partial(render, seen, target.cameras, self._background, masks=target.masks)
             drawn = draw()
+            assert drawn.depth is not None
             median = None if target.depths is None else draw(depth="median").depth
-            rows += self._protocol.measure_views(
-                drawn.image, drawn.depth, target, self._lpips, median_depths=median
+            image = drawn.image if exposures is None else expose(drawn.image, exposures[[view]])
+            (row,) = self._protocol.measure_views(
+                image, drawn.depth, target, self._lpips, median_depths=median
             )
-        return rows
+            fitted = fit_exposure(drawn.image, target.images, target.masks)
+            row["fitted/psnr"] = self._protocol.psnr(fitted, target).item()
+            if seen_from is not None:
+                shown = seen_by_inputs(drawn.depth, target.cameras, *seen_from)
+                row["seen/share"] = shown.float().mean().item()
+                shown = shown if target.masks is None else shown & target.masks
+                row["seen/psnr"] = of_pixels.psnr(image, replace(target, masks=shown)).item()
+            rows.append(row)
+            depths.append(drawn.depth)
+        return rows, torch.cat(depths)
 
     @torch.no_grad()
     def _save_contact_sheet(self, name: str, scene: Gaussians | AnchorScene) -> None:
         """Draw some held-out views, or inputs without any: image, rendering, error and depth."""
         inputs, held_out = self._photographs.inputs, self._photographs.held_out
-        views = inputs if held_out is None else held_out
+        kind, views = ("inputs", inputs) if held_out is None else ("held_out", held_out)
         rows = min(SHEET_ROWS, views.num_views)
-        views = views.select(torch.linspace(0, views.num_views - 1, rows).round().long())
+        shown = torch.linspace(0, views.num_views - 1, rows).round().long()
+        views, exposures = views.select(shown), self._exposures[kind]
         rendering = self._draw(scene, views.cameras)
+        if exposures is not None:
+            image = expose(rendering.image, exposures[shown.to(exposures.device)])
+            rendering = replace(rendering, image=image)
         figure = comparison_figure(inputs, views, rendering)
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)

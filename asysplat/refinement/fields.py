@@ -1,4 +1,4 @@
-"""What a refinement optimizes: the Gaussians' fields, and corrections of the images."""
+"""What a refinement optimizes: the Gaussians' fields, and corrections of the poses."""
 
 import math
 from collections.abc import Mapping
@@ -119,30 +119,24 @@ class Fields:
         }
 
 
-class Corrections:
-    """A gain and an offset per channel, and a small rigid motion, of each input image.
+class Motions:
+    """A small rigid motion of each input camera, of mean 0; none with rate 0."""
 
-    Held-out views and later renderings are not corrected: the mean gain is kept at 1, the mean
-    offset and motion at 0. A correction with rate 0 is off.
-    """
+    def __init__(self, count: int, rate: float, device: torch.device):
+        self._rate = rate
+        self._adam = SelectiveAdam({"poses": torch.zeros(count, 2, 3, device=device)}, eps=1e-8)
 
-    def __init__(self, count: int, rates: Rates, device: torch.device):
-        self._rates = {"exposure": rates.exposure, "poses": rates.poses}
-        zeros = {name: torch.zeros(count, 2, 3, device=device) for name in self._rates}
-        self._adam = SelectiveAdam(zeros, eps=1e-8)
+    def leaves(self) -> list[Float[Tensor, "V 2 3"]]:
+        """Return the motions of all cameras as a leaf of a graph; none with rate 0."""
+        motions = self._adam.parameters.values() if self._rate else ()
+        return [motion.detach().requires_grad_() for motion in motions]
 
-    def leaves(self) -> dict[str, Float[Tensor, "V 2 3"]]:
-        """Return the parameters of all images as leaves of a graph; none if both are off."""
-        parameters = self._adam.parameters.items() if any(self._rates.values()) else ()
-        return {name: tensor.detach().requires_grad_() for name, tensor in parameters}
-
-    def step(self, view: int, gradients: dict[str, Tensor], factor: float) -> None:
-        """Update the parameters of one image, then subtract the mean over all images."""
-        parameters = self._adam.parameters
-        visible = torch.arange(self._adam.num_rows, device=parameters["poses"].device) == view
-        self._adam.step(gradients, {n: rate * factor for n, rate in self._rates.items()}, visible)
-        for tensor in parameters.values():
-            tensor -= tensor.mean(0)
+    def step(self, view: int, gradient: Float[Tensor, "V 2 3"], factor: float) -> None:
+        """Update the motion of one camera, then subtract the mean over all cameras."""
+        motions = self._adam.parameters["poses"]
+        visible = torch.arange(len(motions), device=motions.device) == view
+        self._adam.step({"poses": gradient}, {"poses": self._rate * factor}, visible)
+        motions -= motions.mean(0)
 
 
 def correct_poses(cameras: Cameras, motion: Float[Tensor, "V 2 3"]) -> Cameras:
@@ -156,11 +150,3 @@ def correct_poses(cameras: Cameras, motion: Float[Tensor, "V 2 3"]) -> Cameras:
     center = pose[:, :3, 3:] + pose[:, :3, :3] @ shift[..., None]
     top = torch.cat((rotation, center), dim=-1)
     return replace(cameras, cam_to_world=torch.cat((top, pose[:, 3:]), dim=1))
-
-
-def correct_exposure(
-    images: Float[Tensor, "V 3 H W"], exposure: Float[Tensor, "V 2 3"]
-) -> Float[Tensor, "V 3 H W"]:
-    """Apply gains, given as logarithms, and offsets per channel."""
-    gain, offset = exposure[..., None, None].unbind(1)
-    return images * gain.exp() + offset

@@ -44,7 +44,7 @@ def initial_gaussians(
     prior's depth map, or larger ones.
     """
     pixels = 1.0
-    views = inputs.select(_depth_views(inputs))
+    views = inputs.select(depth_views(inputs))
     longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
         if points is None:
@@ -85,7 +85,7 @@ class KnownDepths:
 
     @torch.no_grad()
     def __init__(self, views: Views):
-        chosen = _depth_views(views)
+        chosen = depth_views(views)
         some = views.select(chosen).map(lambda tensor: tensor[None])
         sweep = PlaneSweepPrior().sweep(some)
         self._maps = torch.stack((sweep.inverse_depth[0], sweep.confidence[0]), dim=1)
@@ -105,7 +105,7 @@ class KnownDepths:
         return (error * confidence).mean()
 
 
-def _depth_views(views: Views) -> list[int]:
+def depth_views(views: Views) -> list[int]:
     return evenly_spaced(range(views.num_views), min(DEPTH_VIEWS, views.num_views))
 
 

@@ -25,10 +25,9 @@ from asysplat.refinement.densification.relocate import McmcDensifier, mcmc_regul
 from asysplat.refinement.densification.spawn import ErrorDensifier
 from asysplat.refinement.fields import (
     MAX_SH_DEGREE,
-    Corrections,
     Fields,
+    Motions,
     Parameters,
-    correct_exposure,
     correct_poses,
 )
 from asysplat.refinement.hull import within_hull
@@ -99,7 +98,7 @@ class Refinement:
         self.background = background
         self._generator = torch.Generator(gaussians.means.device).manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
-        self.corrections = Corrections(views.num_views, settings.rates, views.images.device)
+        self.motions = Motions(views.num_views, settings.rates.poses, views.images.device)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = random_order(views.num_views, self._generator)
@@ -199,16 +198,14 @@ class Refinement:
         leaves: Parameters,
         factor: float,
     ) -> tuple[Tensor, Sequence[Tensor]]:
-        """Render a view and update its corrections; return its MSE and the leaves' gradients."""
-        cameras, correction = target.cameras, self.corrections.leaves()
-        if correction:
-            cameras = correct_poses(cameras, correction["poses"][view, None])
+        """Render a view and update its motion; return its MSE and the leaves' gradients."""
+        cameras, motions = target.cameras, self.motions.leaves()
+        for motion in motions:
+            cameras = correct_poses(cameras, motion[view, None])
         gaussians = self.fields.gaussians(leaves)
         with_depth = self.settings.depth > 0 and factor == 1
         rendering = render(gaussians, cameras, background, depth=with_depth, masks=target.masks)
         image = rendering.image
-        if correction:
-            image = correct_exposure(image, correction["exposure"][view, None])
         if self.settings.ssim is None:
             loss = F.mse_loss(target.masked(image), target.images)
         else:
@@ -217,10 +214,9 @@ class Refinement:
             loss = loss + self.settings.depth * self._known_depths.error(rendering.depth, view)
         if self.settings.densify == "mcmc":
             loss = loss + mcmc_regularizer(gaussians)
-        gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])
-        if correction:
-            correction_gradients = dict(zip(correction, gradients[len(leaves) :], strict=True))
-            self.corrections.step(view, correction_gradients, factor)
+        gradients = torch.autograd.grad(loss, [*leaves.values(), *motions])
+        for gradient in gradients[len(leaves) :]:
+            self.motions.step(view, gradient, factor)
         mse = F.mse_loss(target.masked(image.detach()), target.images)
         return mse, gradients[: len(leaves)]
 

@@ -28,7 +28,6 @@ class Rates:
     opacities: NotNegative
     sh: NotNegative
     sh_rest: NotNegative
-    exposure: NotNegative
     poses: NotNegative
 
 

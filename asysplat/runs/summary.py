@@ -19,7 +19,12 @@ TITLES = {name: title for name, (title, _) in (BASELINES | DEPTH_BASELINES).item
 BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, title in TITLES.items()}
 ROWS = {"trained": "test/{}"} | BASELINE_ROWS
 # The same of a reconstruction, which has one set of photographs
-RECONSTRUCTION_ROWS = {"held out": "held_out", "inputs": "inputs"}
+RECONSTRUCTION_ROWS = {
+    "held out": "held_out",
+    "pixels inputs see": "held_out/seen",
+    "gain, offset fitted": "held_out/fitted",
+    "inputs": "inputs",
+}
 RECONSTRUCTION_ROWS |= {title: f"baseline/{name}" for name, title in TITLES.items()}
 
 

@@ -37,7 +37,7 @@ def test_a_refinement_runs_where_its_inputs_are(scene, monkeypatch, densify):
         max_gaussians=100,
         ssim=0.2,
         every=schedule if densify == "gradient" else None,
-        rates=replace(DEFAULT.rates, exposure=1e-3, poses=1e-4),
+        rates=replace(DEFAULT.rates, poses=1e-4),
     )
     expected, status = watched(gaussians, views, settings)
     with pretended_device(monkeypatch) as device:

@@ -391,27 +391,24 @@ def test_means_move_in_their_unit(unit):
 
 
 @pytest.mark.medium
-def test_exposure_and_pose_corrections_improve_held_out_views(room, start):
-    """Of four inputs, one is too dark and one too bright; their positions are a little wrong."""
-    inputs, held = room[0].select([0, 3, 6, 9]), replace(room[1], images=0.7 * room[1].images)
+def test_pose_corrections_improve_held_out_views(room, start):
+    """The positions of two of four inputs are a little wrong."""
+    inputs, held = room[0].select([0, 3, 6, 9]), room[1]
     poses, shift = inputs.cameras.cam_to_world.clone(), torch.tensor([0.03, -0.02, 0.01])
     poses[1, :3, 3] += shift
     poses[3, :3, 3] -= shift
-    images = inputs.images * torch.tensor([0.7, 0.49, 0.7, 1])[:, None, None, None]
-    wrong = Views(replace(inputs.cameras, cam_to_world=poses), images)
+    wrong = replace(inputs, cameras=replace(inputs.cameras, cam_to_world=poses))
     found = []
-    for rates in (DEFAULT.rates, replace(DEFAULT.rates, exposure=0.03, poses=3e-3)):
+    for rates in (DEFAULT.rates, replace(DEFAULT.rates, poses=3e-3)):
         settings = replace(
             DEFAULT, rates=rates, densify="none", half_resolution_until=0.0, sh_degree=0
         )
         last, states = watched(start, wrong, settings, lambda _, state: state, steps=80)
-        found.append((quality(last, held), states[-1].corrections.leaves()))
-    (before, none), (after, learned) = found
-    assert not none and after > before + 1.5
-    gains = learned["exposure"][:, 0].mean(1)
-    assert gains[1] < -0.1 < gains[0] and gains[2] < 0.1 < gains[3]
-    assert all(tensor.mean(0).abs().max() < 1e-6 for tensor in learned.values())
-    corrected = correct_poses(wrong.cameras, learned["poses"]).centers
+        found.append((quality(last, held), states[-1].motions.leaves()))
+    (before, none), (after, (motions,)) = found
+    assert not none and after > before
+    assert motions.mean(0).abs().max() < 1e-6
+    corrected = correct_poses(wrong.cameras, motions).centers
     errors = (corrected - inputs.cameras.centers).norm(dim=-1)
     assert (errors < 0.75 * shift.norm()).all()
 

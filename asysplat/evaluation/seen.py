@@ -1,0 +1,32 @@
+"""Which pixels of a view show what some input photograph shows, too."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from asysplat.scene import Cameras
+
+SAME_DEPTH = 0.05  # relative difference of two depths of one surface
+
+
+def seen_by_inputs(
+    depth: Float[Tensor, "T H W"],
+    cameras: Cameras,
+    input_depth: Float[Tensor, "V h w"],
+    inputs: Cameras,
+) -> Bool[Tensor, "T H W"]:
+    """Compute whether the surface at each pixel is what some input sees there.
+
+    Args:
+        depth: depths of T views, as `render` returns them; where they are 0, nothing is seen.
+        input_depth: those of V inputs.
+    """
+    pose, local = cameras.cam_to_world[:, None, None], cameras.pixel_directions() * depth[..., None]
+    points = ((pose[..., :3, :3] @ local[..., None])[..., 0] + pose[..., :3, 3]).flatten(0, 2)
+    seen = torch.zeros_like(depth, dtype=torch.bool).flatten()
+    for view in range(inputs.num_views):  # of all at once the projections would take much memory
+        pixels, apart, inside = (part[0] for part in inputs.select([view]).project(points))
+        column, row = pixels[inside].long().unbind(-1)
+        found = input_depth[view, row, column]
+        seen[inside] |= (apart[inside] - found).abs() < SAME_DEPTH * found
+    return seen.view(depth.shape) & (depth > 0)
