@@ -170,6 +170,19 @@ class Cameras(TensorRecord):
         size = pixels.new_tensor([self.width, self.height])
         return pixels, depth, (depth > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
 
+    def distances(self, others: "Cameras") -> Float[Tensor, "*batch V W"]:
+        """Compute how far other cameras are: distance / extent + angle / pi.
+
+        The distance is between the centers, the extent the largest between two of the others, and
+        the angle between the viewing directions, which alone counts if they share one center.
+        """
+        apart = (self.centers[..., :, None, :] - others.centers[..., None, :, :]).norm(dim=-1)
+        among = (others.centers[..., :, None, :] - others.centers[..., None, :, :]).norm(dim=-1)
+        extent = among.amax((-2, -1), keepdim=True)
+        cosine = self.cam_to_world[..., :3, 2] @ others.cam_to_world[..., :3, 2].mT
+        angle = cosine.clamp(-1, 1).acos()
+        return apart / extent.where(extent > 0, torch.inf) + angle / torch.pi
+
     def validate(self, name: str = "Cameras") -> "Cameras":
         """Return self if all numbers are usable.
 
@@ -270,6 +283,18 @@ class Views(TensorRecord):
         selected = {n: m.index_select(-3, index) for n, m in maps.items() if m is not None}
         images = self.images.index_select(-4, index)
         return replace(self, cameras=self.cameras.select(index), images=images, **selected)
+
+    @property
+    def known_depths(self) -> Float[Tensor, "*batch V H W"] | None:
+        """The depths, 0 where they are unknown or a mask excludes the pixel."""
+        if self.depths is None or self.masks is None:
+            return self.depths
+        return self.depths.where(self.masks, 0)
+
+    def nearest_images(self, cameras: Cameras) -> Tensor:
+        """Return [..., W, 3, H, W], for each of the cameras the image of the nearest view."""
+        nearest = cameras.distances(self.cameras).argmin(-1)
+        return self.images.take_along_dim(nearest[..., None, None, None], dim=-4)
 
     def decoded(self) -> "Views":
         """Return views whose images are in [0, 1]."""

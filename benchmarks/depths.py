@@ -9,7 +9,7 @@ from rich.table import Table
 
 from asysplat.data import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
-from asysplat.evaluation.metrics import abs_rel, delta1, known_depths
+from asysplat.evaluation.metrics import abs_rel, delta1
 from asysplat.models import PlaneSweepPrior
 from asysplat.refinement.init import MIN_CONFIDENCE
 from asysplat.scene import Views
@@ -51,7 +51,7 @@ def _row(name: str, views: Views) -> Result:
     clock = time.perf_counter()
     sweep = PlaneSweepPrior().sweep(views.map(lambda tensor: tensor[None]))
     seconds = time.perf_counter() - clock
-    target = known_depths(views.resized(SIDE, SIDE))
+    target = views.resized(SIDE, SIDE).known_depths
     assert target is not None
     depth, sure = 1 / sweep.inverse_depth[0].clamp_min(1e-6), sweep.confidence[0] > MIN_CONFIDENCE
     error = (depth - target).abs() / target

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from matplotlib.figure import Figure
 
-from asysplat.evaluation.metrics import BASELINES, known_depths, nearest_view_images, psnr
+from asysplat.evaluation.metrics import BASELINES, psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views, inverse_depths
 
@@ -22,14 +22,14 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     the last two where the depth is unknown.
     """
     images = {
-        "nearest input": nearest_view_images(inputs, targets),
+        "nearest input": inputs.nearest_images(targets.cameras),
         "target": targets.images,
         "rendered": rendering.image,
     }
     maps = {"error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1)}
     if rendering.depth is not None:
         maps["inverse depth"] = inverse_depths(rendering.depth)
-    if (true := known_depths(targets)) is not None:
+    if (true := targets.known_depths) is not None:
         true = true.where(true > 0, torch.nan)
         maps["true inverse depth"] = 1 / true
         if rendering.depth is not None:

@@ -135,13 +135,6 @@ def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -
     return _mean_where(valid, close.float())
 
 
-def known_depths(views: Views) -> Depths | None:
-    """Return the views' depths, 0 where they are unknown or a mask excludes the pixel."""
-    if views.depths is None or views.masks is None:
-        return views.depths
-    return views.depths.where(views.masks, 0)
-
-
 def _prepare(
     depth: Depths, target: Depths, alignment: Alignment
 ) -> tuple[Depths, Depths, Bool[Tensor, "*batch V H W"]]:
@@ -166,23 +159,13 @@ def mean_color_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt
 
 
 def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """Copy the nearest input view for every target; all images have one size.
-
-    The nearest view minimizes distance / extent + angle / pi: the distance between the camera
-    centers, the extent (the largest distance between two input centers), and the angle between the
-    viewing directions. If all inputs share one center, the angle alone decides.
-    """
-    to, given = targets.cameras, inputs.cameras
-    extent = _distances(given.centers, given.centers).amax((-2, -1), keepdim=True)
-    cosine = to.cam_to_world[..., :3, 2] @ given.cam_to_world[..., :3, 2].mT
-    distance = _distances(to.centers, given.centers) / extent.where(extent > 0, torch.inf)
-    nearest = (distance + cosine.clamp(-1, 1).acos() / torch.pi).argmin(-1)
-    return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
+    """Copy the nearest input view, see `Cameras.distances`, for every target of the same size."""
+    return inputs.nearest_images(targets.cameras)
 
 
 def constant_depths(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt H W"]:
     """Fill every target with the depth of the mean inverse depth that the inputs know; else 0."""
-    inverse = 1 / known_depths(inputs)
+    inverse = 1 / inputs.known_depths
     mean = inverse.where(inverse.isfinite(), torch.nan).flatten(-3).nanmean(-1)
     return (1 / mean).nan_to_num()[..., None, None, None].expand_as(targets.depths)
 
@@ -194,12 +177,6 @@ BASELINES = {  # name in results: title in tables, and what draws the targets
 DEPTH_BASELINES = {  # likewise, their depths
     "mean_inverse_depth": ("mean inverse depth", constant_depths)
 }
-
-
-def _distances(
-    a: Float[Tensor, "*batch A 3"], b: Float[Tensor, "*batch B 3"]
-) -> Float[Tensor, "*batch A B"]:
-    return (a[..., :, None, :] - b[..., None, :, :]).norm(dim=-1)
 
 
 ImageRow = dict[str, str | float | int]

@@ -95,7 +95,7 @@ class Protocol:
             targets: {} is returned if they have no depths.
             median_depth: `render`'s, whose AbsRel and delta are added; it is wrong where it is 0.
         """
-        target = metrics.known_depths(targets)
+        target = targets.known_depths
         if target is None:
             return {}
         values = {

@@ -77,9 +77,10 @@ def predict_exposures(
     They are multiplied by how much of the inputs' own gains their neighbors explain: all where a
     camera adapted slowly, nothing where exposures jump.
     """
-    known = _nearest_mean(exposures, inputs, inputs)
-    unexplained = (exposures - known).square().sum() / exposures.square().sum().clamp_min(1e-12)
-    return (1 - unexplained).clamp_min(0) * _nearest_mean(exposures, inputs, cameras)
+    apart = inputs.distances(inputs).fill_diagonal_(math.inf)
+    error = (exposures - _nearest_mean(exposures, apart)).square().sum()
+    explained = (1 - error / exposures.square().sum().clamp_min(1e-12)).clamp_min(0)
+    return explained * _nearest_mean(exposures, cameras.distances(inputs))
 
 
 def _compare(views: Views) -> Iterator[tuple[tuple[int, int], Float[Tensor, "places 3"]]]:
@@ -93,8 +94,9 @@ def _compare(views: Views) -> Iterator[tuple[tuple[int, int], Float[Tensor, "pla
     if small.masks is not None:
         images = images * small.masks[:, None]  # too dark to compare
     poses, directions = cameras.cam_to_world, cameras.pixel_directions()
-    for view, near in enumerate(_nearest(cameras, cameras.select(swept), NEAREST)[0].tolist()):
-        for row in near:
+    near = cameras.distances(cameras.select(swept)).argsort(-1)[:, : NEAREST + 1]
+    for view, rows_near in enumerate(near.tolist()):
+        for row in rows_near:
             other, at = swept[row], known[row]
             if other == view:
                 continue
@@ -120,25 +122,13 @@ def _sample(
     return sampled[0, :, 0].mT
 
 
-def _nearest(
-    cameras: Cameras, others: Cameras, count: int
-) -> tuple[Int[Tensor, "V K"], Float[Tensor, "V K"]]:
-    """Find the nearest of other cameras; those at the same place and in the same direction last."""
-    apart = torch.cdist(cameras.centers, others.centers)
-    turned = 1 - cameras.cam_to_world[:, :3, 2] @ others.cam_to_world[:, :3, 2].mT
-    distance = apart / apart.median().clamp_min(1e-12) + 2 * turned
-    distance = distance.masked_fill(distance < 1e-6, math.inf)
-    found = distance.topk(min(count, others.num_views), largest=False)
-    return found.indices, found.values
-
-
 def _nearest_mean(
-    exposures: Float[Tensor, "V 3"], inputs: Cameras, cameras: Cameras
+    exposures: Float[Tensor, "V 3"], distances: Float[Tensor, "T V"]
 ) -> Float[Tensor, "T 3"]:
-    """Average the log gains of each camera's nearest inputs, weighted by inverse distance."""
-    index, distance = _nearest(cameras, inputs, PREDICTED_BY)
-    weights = 1 / distance.clamp_max(1e12)
-    return (exposures[index] * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
+    """Average the log gains of the nearest inputs, weighted by inverse distance."""
+    near = distances.topk(min(PREDICTED_BY, len(exposures)), largest=False)
+    weights = 1 / near.values.clamp(1e-6, 1e6)
+    return (exposures[near.indices] * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
 
 
 def _disagreement(
@@ -162,9 +152,9 @@ def _fit(
     scale = weight = to_float64(weights / weights.mean()).cpu()[:, None]
     difference = difference.cpu()
     for _ in range(REWEIGHTINGS):
-        rows = torch.cat((signs * weight, prior))
+        equations = torch.cat((signs * weight, prior))
         wanted = torch.cat((difference * weight, prior.new_zeros(count, 3)))
-        gains = torch.linalg.lstsq(rows, wanted).solution
+        gains = torch.linalg.lstsq(equations, wanted).solution
         error = (signs @ gains - difference).abs().mean(1, keepdim=True)
         weight = scale / (1 + error / ROBUST)
     return (gains - gains.mean(0)).to(differences)
