@@ -23,7 +23,7 @@ ROBUST = 0.05  # difference of log gains that halves the weight of a pair
 REWEIGHTINGS = 5
 MIN_SPREAD = 0.02  # least spread of a pair's log ratios: fewer differ by more than noise
 UNCHANGED = 0.9  # share of the disagreement that gains must not leave, or they are none
-PREDICTED_BY = 2  # inputs on whose exposure that of another photograph is based
+PREDICTED_BY = 4  # inputs on whose exposure that of another photograph is based
 
 
 @torch.no_grad()
@@ -125,9 +125,9 @@ def _sample(
 def _nearest_mean(
     exposures: Float[Tensor, "V 3"], distances: Float[Tensor, "T V"]
 ) -> Float[Tensor, "T 3"]:
-    """Average the log gains of the nearest inputs, weighted by inverse distance."""
+    """Average the log gains of the nearest inputs, weighted by inverse square distance."""
     near = distances.topk(min(PREDICTED_BY, len(exposures)), largest=False)
-    weights = 1 / near.values.clamp(1e-6, 1e6)
+    weights = 1 / near.values.clamp(1e-6, 1e6).square()
     return (exposures[near.indices] * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
 
 
