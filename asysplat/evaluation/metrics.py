@@ -12,7 +12,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
-from asysplat.kernels.dispatch import without_autocast
+from asysplat.kernels.dispatch import to_float64, without_autocast
 from asysplat.scene import Views
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
@@ -55,7 +55,7 @@ def fit_exposure(rendered: Images, target: Images, masks: Masks | None = None) -
 
     Only pixels in masks count; a channel without contrast becomes its target's mean.
     """
-    x, y = rendered.double(), target.double()
+    x, y = to_float64(rendered), to_float64(target)
     weight = torch.ones_like(x[..., :1, :, :]) if masks is None else masks[..., None, :, :].to(x)
     total = weight.sum((-2, -1), keepdim=True).clamp_min(1)
 

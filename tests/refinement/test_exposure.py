@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from pretend_device import DEVICE, pretended_device
 
 from asysplat.data.procedural import ProceduralScene
 from asysplat.evaluation.metrics import fit_exposure, psnr
@@ -107,3 +108,13 @@ def test_a_fitted_exposure_restores_a_gain_and_an_offset():
         fit_exposure(torch.zeros(1, 3, 8, 9), target[:1]),
         target[:1].mean((-2, -1), keepdim=True).expand(1, 3, 8, 9),
     )
+
+
+def test_exposures_are_found_on_a_device(room, jumps, monkeypatch):
+    dark, held = photographed(room[0], jumps), room[1].cameras
+    with pretended_device(monkeypatch) as device:
+        there = dark.to(device)
+        found = find_exposures(there)
+        assert found is not None and found.device == DEVICE
+        assert even_exposures(there, found).images.device == DEVICE
+        assert predict_exposures(found, there.cameras, held.to(device)).device == DEVICE
