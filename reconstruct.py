@@ -120,8 +120,9 @@ def reconstruct(config: DictConfig) -> None:
         results.save(gaussians, display.last)
         fits_all = photographs.held_out is not None and not photographs.is_split
         if config.last_fit and fits_all and not display.stopped:
-            left = config.last_fit, options
-            gaussians = fit_to_all(gaussians, photographs, exposures, settings, *left)
+            gaussians = fit_to_all(
+                gaussians, photographs, exposures, settings, config.last_fit, options
+            )
             results.save_scene(gaussians)
         results.save_video(gaussians)
         display.show(gaussians)
@@ -179,9 +180,8 @@ def fit_to_all(
 ) -> Gaussians:
     """Refine Gaussians on all photographs for a fraction of the limit, without new Gaussians."""
     views = photographs.all_views()
-    every = None if exposures is None else find_exposures(views)
-    if exposures is not None and every is not None:
-        views = even_exposures(views, every - every[: len(exposures)].mean(0))  # as the inputs were
+    if exposures is not None and (found := find_exposures(views)) is not None:
+        views = even_exposures(views, found - found[: len(exposures)].mean(0))  # as the inputs were
     print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
     settings = replace(
         settings, half_resolution_until=0.0, densify="none", every=None, cool_down=1.0

@@ -204,6 +204,19 @@ def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
 
 
 @pytest.mark.medium
+def test_photographs_of_other_exposures_are_fitted_as_if_of_one(command, views, tmp_path):
+    gains = torch.tensor([0.7, 1.0]).repeat(views.num_views)[: views.num_views, None, None, None]
+    write_transforms(replace(views, images=views.images * gains), tmp_path / "scene")
+    quality = {}
+    for exposure in ("given", "auto"):
+        said = finished(command(tmp_path / "scene", f"exposure={exposure}", "last_fit=0.5"))
+        assert ("1.4 times as bright as others" in said) == (exposure == "auto")
+        quality[exposure] = numbers_of(tmp_path / "run")
+    for name in ("inputs/psnr", "held_out/fitted/psnr"):
+        assert quality["auto"][name] > quality["given"][name], name
+
+
+@pytest.mark.medium
 def test_masked_photographs_measure_alike_by_both_scripts(
     command, first, views, run_script, tmp_path
 ):

@@ -24,7 +24,7 @@ def seen_by_inputs(
     pose, local = cameras.cam_to_world[:, None, None], cameras.pixel_directions() * depth[..., None]
     points = ((pose[..., :3, :3] @ local[..., None])[..., 0] + pose[..., :3, 3]).flatten(0, 2)
     seen = torch.zeros_like(depth, dtype=torch.bool).flatten()
-    for view in range(inputs.num_views):  # of all at once the projections would take much memory
+    for view in range(inputs.num_views):  # projections of all at once would take much memory
         pixels, apart, inside = (part[0] for part in inputs.select([view]).project(points))
         column, row = pixels[inside].long().unbind(-1)
         found = input_depth[view, row, column]

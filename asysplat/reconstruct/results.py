@@ -185,7 +185,7 @@ class Results:
         seen_from = None
         for name, (views, files) in sets.items():
             numbers, depths = self._measure(scene, views, self._exposures[name], seen_from)
-            seen_from = depths, views.cameras  # of the inputs, which come first
+            seen_from = depths, views.cameras  # inputs come first
             results |= _means(name, numbers)
             labels = ({"set": name, "file": file} for file in files)
             rows += [label | row for label, row in zip(labels, numbers, strict=True)]
