@@ -358,6 +358,11 @@ class Views(TensorRecord):
             return rendered
         return torch.where(self.masks[..., None, :, :], rendered, self.images)
 
+    def without(self, pixels: Bool[Tensor, "*batch V H W"]) -> "Views":
+        """Mask out pixels, too."""
+        masks = ~pixels if self.masks is None else self.masks & ~pixels
+        return replace(self, masks=masks)
+
     def over(self, before: Tensor, color: Tensor) -> "Views":
         """Change the color, RGB, that transparent pixels show; opaque ones stay."""
         if self.alphas is None:

@@ -58,8 +58,7 @@ def even_exposures(views: Views, exposures: Float[Tensor, "V 3"]) -> Views:
     """
     images = expose(views.images, -exposures).clamp(0, 1)
     clipped = ((views.images >= CLIPPED) & (exposures > 0)[..., None, None]).any(1)
-    masks = ~clipped if views.masks is None else views.masks & ~clipped
-    return replace(views, images=images, masks=masks)
+    return replace(views, images=images).without(clipped)
 
 
 def expose(

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -34,6 +34,7 @@ from asysplat.refinement.hull import within_hull
 from asysplat.refinement.init import KnownDepths
 from asysplat.refinement.isotropic import footprints, random_order
 from asysplat.refinement.settings import DEFAULT, RefinementSettings
+from asysplat.refinement.transients import MOMENTS, find_transients
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
@@ -90,7 +91,7 @@ class Refinement:
         if gaussians.num_gaussians == 0:
             raise InputError("refine got no Gaussians: start from at least one.")
         gaussians.validate("refine's gaussians")
-        self.views = views = views.validate("refine's views").decoded()
+        self.views = self._given = views = views.validate("refine's views").decoded()
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings = settings
         if background is None:
@@ -102,7 +103,7 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = random_order(views.num_views, self._generator)
-        self._steps = self._rounds = 0
+        self._steps = self._rounds = self._comparisons = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
 
@@ -129,6 +130,10 @@ class Refinement:
                 self._rounds = due
             if schedule and self._steps and self._steps % schedule.opacity_reset == 0:
                 self.reset_opacities()
+        due = sum(progress > moment for moment in MOMENTS)
+        if settings.leave_out_transients and due > self._comparisons:
+            found, self._comparisons = find_transients(self._differences()), due
+            self.views = self._given if found is None else self._given.without(found)
         return self.step(progress)
 
     def step(self, progress: float) -> Float[Tensor, ""]:
@@ -219,6 +224,16 @@ class Refinement:
             self.motions.step(view, gradient, factor)
         mse = F.mse_loss(target.masked(image.detach()), target.images)
         return mse, gradients[: len(leaves)]
+
+    def _differences(self) -> Iterator[Float[Tensor, "1 3 H W"]]:
+        gaussians = self.fields.gaussians()
+        for row in range(self._given.num_views):
+            view = self._given.select([row])
+            cameras = view.cameras
+            for motion in self.motions.leaves():
+                cameras = correct_poses(cameras, motion[row, None])
+            image = render(gaussians, cameras, self.background, masks=view.masks).image
+            yield view.masked(image) - view.images
 
     def _views(self, progress: float) -> Views:
         return self._half_views if progress < self.settings.half_resolution_until else self.views
