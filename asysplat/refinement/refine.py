@@ -19,6 +19,7 @@ from asysplat.errors import InputError
 from asysplat.kernels.dispatch import check_device
 from asysplat.ops.image_loss import image_loss
 from asysplat.ranges import Count, Positive, check_options
+from asysplat.refinement.blur import find_blurred
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
 from asysplat.refinement.densification.relocate import McmcDensifier, mcmc_regularizer
@@ -103,6 +104,8 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = random_order(views.num_views, self._generator)
+        blurred = find_blurred(views.images, views.cameras) if settings.robust else []
+        self._blurred = {row for row, is_blurred in enumerate(blurred) if is_blurred}
         self._steps = self._rounds = self._comparisons = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
@@ -131,7 +134,7 @@ class Refinement:
             if schedule and self._steps and self._steps % schedule.opacity_reset == 0:
                 self.reset_opacities()
         due = sum(progress > moment for moment in MOMENTS)
-        if settings.leave_out_transients and due > self._comparisons:
+        if settings.robust and due > self._comparisons:
             found, self._comparisons = find_transients(self._differences()), due
             self.views = self._given if found is None else self._given.without(found)
         return self.step(progress)
@@ -139,8 +142,10 @@ class Refinement:
     def step(self, progress: float) -> Float[Tensor, ""]:
         """Take a step at a progress in [0, 1]; return its mean squared error."""
         settings, views = self.settings, self._views(progress)
-        chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
         leaves, cool_down = self.fields.leaves(), settings.cool_down
+        left_out = self._blurred if progress > 1 - cool_down else ()
+        order = (view for view in self._view_order if view not in left_out)
+        chosen = list(islice(order, settings.views_per_step or views.num_views))
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
         cooled = max(0.0, (progress - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled

@@ -70,7 +70,7 @@ class RefinementSettings:
     every: StepSchedule | None
     final_lr_factor: Fraction
     cool_down: Fraction
-    leave_out_transients: bool
+    robust: bool
     decay_means_alone: bool
     max_steps_per_image: Count | None
 

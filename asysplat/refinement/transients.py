@@ -13,7 +13,8 @@ CELLS, MIN_CELL = (
     4,
 )  # number in an image's height, least pixels: finer detail may be missing yet
 CHANGED = 0.2  # least difference of a cell's mean color, more than detail makes
-DIFFERENT = 0.05  # least mean difference around a pixel that is left out, in or beside such a cell
+LEAST = 4  # such cells of 3 x 3: a single one may show a detail that is placed wrongly yet
+DIFFERENT = 0.05  # least mean difference around a pixel that is left out, in or near such cells
 RARE = 1 / 3  # share of photographs with such cells from which on it is the fit that fails
 
 
@@ -35,7 +36,8 @@ def find_transients(
         cells = F.interpolate(difference, (-(-height // cell), -(-width // cell)), mode="area")
         changed = (cells.abs().mean(1, keepdim=True) > CHANGED).to(difference)
         has_some.append(changed.max())
-        around = F.interpolate(F.max_pool2d(changed, 3, stride=1, padding=1), size)
+        clumps = changed * (F.avg_pool2d(changed, 3, stride=1, padding=1) * 9 > LEAST - 0.5)
+        around = F.interpolate(F.max_pool2d(clumps, 5, stride=1, padding=2), size)
         near = F.avg_pool2d(difference.abs().mean(1, keepdim=True), 3, stride=1, padding=1)
         transient.append(((around > 0) & (near > DIFFERENT))[0])
     return torch.cat(transient) if 0 < torch.stack(has_some).mean() < RARE else None

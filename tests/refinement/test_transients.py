@@ -32,7 +32,7 @@ def passed(room, where):
 @pytest.mark.medium
 def test_what_stands_in_one_photograph_leaves_no_ghost_and_no_hole(room, where, passed):
     views, quality = room[0], {}
-    fit_all = replace(DEFAULT, leave_out_transients=False)
+    fit_all = replace(DEFAULT, robust=False)
     fits = {"all": (passed, fit_all), "found": (passed, DEFAULT)}
     fits["known"] = (replace(passed, masks=~where), fit_all)
     for name, (photographs, settings) in fits.items():
