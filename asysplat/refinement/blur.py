@@ -15,7 +15,7 @@ def find_blurred(images: Float[Tensor, "V 3 H W"], cameras: Cameras) -> Bool[Ten
 
     Sharpness is the root of the mean square of the Laplacian of the gray image.
     """
-    gray = images.mean(1, keepdim=True)
+    gray = F.pad(images.mean(1, keepdim=True), (1, 1, 1, 1), mode="replicate")
     kernel = gray.new_tensor([[0, 1, 0], [1, -4, 1], [0, 1, 0]])[None, None]
     sharpness = F.conv2d(gray, kernel).square().mean((1, 2, 3)).sqrt()
     apart = cameras.distances(cameras)
