@@ -143,7 +143,9 @@ class Refinement:
         """Take a step at a progress in [0, 1]; return its mean squared error."""
         settings, views = self.settings, self._views(progress)
         leaves, cool_down = self.fields.leaves(), settings.cool_down
-        left_out = self._blurred if progress > 1 - cool_down else ()
+        # Not before the last densification, which removes what no step shows.
+        last = max(1 - cool_down, settings.densify_until)
+        left_out = self._blurred if progress > last else ()
         order = (view for view in self._view_order if view not in left_out)
         chosen = list(islice(order, settings.views_per_step or views.num_views))
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
