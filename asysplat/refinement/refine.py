@@ -104,8 +104,10 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = random_order(views.num_views, self._generator)
-        blurred = find_blurred(views.images, views.cameras) if settings.robust else []
-        self._blurred = {row for row, is_blurred in enumerate(blurred) if is_blurred}
+        self._blurred = []
+        if settings.robust:
+            found = find_blurred(views.images, views.cameras)
+            self._blurred = torch.nonzero(found)[:, 0].tolist()
         self._steps = self._rounds = self._comparisons = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
         self._densifier = self._make_densifier()
@@ -145,9 +147,10 @@ class Refinement:
         leaves, cool_down = self.fields.leaves(), settings.cool_down
         # Not before the last densification, which removes what no step shows.
         last = max(1 - cool_down, settings.densify_until)
-        left_out = self._blurred if progress > last else ()
+        left_out = self._blurred if progress > last else []
         order = (view for view in self._view_order if view not in left_out)
-        chosen = list(islice(order, settings.views_per_step or views.num_views))
+        all_views = views.num_views - len(left_out)
+        chosen = list(islice(order, settings.views_per_step or all_views))
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
         cooled = max(0.0, (progress - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled

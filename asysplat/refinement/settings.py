@@ -57,6 +57,7 @@ class RefinementSettings:
     rates: Rates
     ssim: NotNegative | None
     depth: NotNegative
+    robust: bool
     few_views: Index
     views_per_step: Count | None
     sh_degree: Annotated[int, Field(ge=0, le=3)] | None
@@ -70,7 +71,6 @@ class RefinementSettings:
     every: StepSchedule | None
     final_lr_factor: Fraction
     cool_down: Fraction
-    robust: bool
     decay_means_alone: bool
     max_steps_per_image: Count | None
 

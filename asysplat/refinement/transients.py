@@ -8,10 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MOMENTS = (0.2, 0.6)  # progress at which a scene is drawn: it shows what most photographs agree on
-CELLS, MIN_CELL = (
-    28,
-    4,
-)  # number in an image's height, least pixels: finer detail may be missing yet
+CELLS = 28  # in an image's height: finer detail may be missing yet
+MIN_CELL = 4  # pixels a side
 CHANGED = 0.2  # least difference of a cell's mean color, more than detail makes
 LEAST = 4  # such cells of 3 x 3: a single one may show a detail that is placed wrongly yet
 DIFFERENT = 0.05  # least mean difference around a pixel that is left out, in or near such cells
@@ -27,7 +25,7 @@ def find_transients(
     None without such pixels, and where many photographs have some.
 
     Args:
-        differences: of the rendering and the photograph, for one after the other.
+        differences: rendering minus photograph, one photograph after the other.
     """
     transient, has_some = [], []
     for difference in differences:
