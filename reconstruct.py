@@ -38,6 +38,7 @@ from asysplat.data.cameras import CameraOptions
 from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
+from asysplat.export.importance import without_unseen
 from asysplat.export.viewer import Viewer
 from asysplat.ranges import Count, Fraction, Positive, check_options, check_training
 from asysplat.reconstruct.continuation import continue_run
@@ -115,6 +116,7 @@ def reconstruct(config: DictConfig) -> None:
             results.save_video(anchors)
             return
         gaussians = refine(gaussians, fitted.inputs, settings, **options)
+        gaussians = without_unseen(gaussians, fitted.inputs)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
@@ -188,7 +190,7 @@ def fit_to_all(
     )
     for name in {"steps", "seconds"} & options.keys():
         options = options | {name: type(options[name])(max(1, fraction * options[name]))}
-    return refine(gaussians, views, settings, **options)
+    return without_unseen(refine(gaussians, views, settings, **options), views)
 
 
 def given_options() -> set[str]:

@@ -83,7 +83,7 @@ def test_a_gpu_takes_more_unless_something_is_chosen(composed, capsys):
     assert "quality=gpu; to avoid it, quality=good" in capsys.readouterr().out
     given = {"height", "refinement.sh_degree"}
     kept = script.for_device(config, cuda, given)
-    assert (kept.height, kept.refinement.sh_degree) == (256, 1)
+    assert (kept.height, kept.refinement.sh_degree) == (256, 2)
     assert (kept.seconds, kept.refinement.max_gaussians) == (30, 1_000_000)
     for given in ({"quality"}, {"refinement"}):
         assert script.for_device(config, cuda, given) is config

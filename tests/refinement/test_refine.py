@@ -78,7 +78,7 @@ def test_input_and_held_out_views_improve(room, start, kind):
     assert quality(found, held) >= quality(start, held) + 4
     least, most = {"error": (1000, 1500), "none": (0, 0)}.get(kind, (1, 1500))
     assert least <= found.num_gaussians - start.num_gaussians <= most
-    assert found.sh.shape[1] == 4
+    assert found.sh.shape[1] == 9
     if kind == "error":
         without = refine(start, views, replace(DEFAULT, densify="none"), steps=80)
         assert quality(found, held) >= quality(without, held) + 0.5
@@ -206,8 +206,8 @@ def test_faint_and_invisible_gaussians_are_pruned():
 
 
 def padded(gaussians):
-    """Gaussians as `Fields` gives them back, with SH of degree 1."""
-    sh = torch.cat((gaussians.sh, torch.zeros(gaussians.num_gaussians, 3, 3)), 1)
+    """Gaussians as `Fields` gives them back, with SH of degree 2."""
+    sh = torch.cat((gaussians.sh, torch.zeros(gaussians.num_gaussians, 8, 3)), 1)
     opacities = gaussians.opacities.logit().sigmoid()
     return replace(gaussians, sh=sh, opacities=opacities, scales=gaussians.scales.log().exp())
 

@@ -36,10 +36,12 @@ def test_what_stands_in_one_photograph_leaves_no_ghost_and_no_hole(room, where, 
     fits = {"all": (passed, fit_all), "found": (passed, DEFAULT)}
     fits["known"] = (replace(passed, masks=~where), fit_all)
     for name, (photographs, settings) in fits.items():
-        start = initial_gaussians("plane_sweep", photographs, settings.initial_limit)
-        scene = refine(start, photographs, settings, steps=400)
-        image = render(scene, views.cameras.select(IN), views.mean_color()).image
-        quality[name] = psnr(image, views.images[IN], where[IN]).mean().item()
+        start, values = initial_gaussians("plane_sweep", photographs, settings.initial_limit), []
+        for seed in (0, 1):
+            scene = refine(start, photographs, settings, steps=400, seed=seed)
+            image = render(scene, views.cameras.select(IN), views.mean_color()).image
+            values.append(psnr(image, views.images[IN], where[IN]).mean().item())
+        quality[name] = sum(values) / len(values)
     assert quality["found"] > quality["all"] + 0.5, quality
     assert quality["found"] > quality["known"] - 0.5, quality
 
