@@ -38,7 +38,6 @@ from asysplat.data.cameras import CameraOptions
 from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
-from asysplat.export.importance import without_unseen
 from asysplat.export.viewer import Viewer
 from asysplat.ranges import Count, Fraction, Positive, check_options, check_training
 from asysplat.reconstruct.continuation import continue_run
@@ -52,6 +51,7 @@ from asysplat.refinement import (
     refine,
     refine_scaffold,
     with_options,
+    without_unseen,
 )
 from asysplat.refinement.exposure import even_exposures, find_exposures
 from asysplat.refinement.init import INITS, initial_gaussians

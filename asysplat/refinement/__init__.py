@@ -1,7 +1,7 @@
 """Fit the Gaussians of one scene to its images: initialization, merging, refinement."""
 
 from asysplat.refinement.init import merge_to_limit
-from asysplat.refinement.refine import Refinement, RefinementProgress, refine
+from asysplat.refinement.refine import Refinement, RefinementProgress, refine, without_unseen
 from asysplat.refinement.scaffold_gs import (
     SCAFFOLD_GS,
     AnchorScene,
@@ -36,4 +36,5 @@ __all__ = [
     "refine",
     "refine_scaffold",
     "with_options",
+    "without_unseen",
 ]

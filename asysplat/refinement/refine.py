@@ -36,8 +36,10 @@ from asysplat.refinement.init import KnownDepths
 from asysplat.refinement.isotropic import footprints, random_order
 from asysplat.refinement.settings import DEFAULT, RefinementSettings
 from asysplat.refinement.transients import MOMENTS, find_transients
-from asysplat.rendering import render
+from asysplat.rendering import blending_weights, render
 from asysplat.scene import Gaussians, Views
+
+SEEN = 0.2  # least sum of blending weights, in pixels: below .05 are 10 %, below .5 33 % of all
 
 
 @dataclass(frozen=True)
@@ -294,6 +296,15 @@ def refine(
     run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
     refined = refinement.gaussians
     return refined if views.alphas is None else within_hull(refined, views)
+
+
+def without_unseen(gaussians: Gaussians, inputs: Views) -> Gaussians:
+    """Leave out the Gaussians that no input shows, whose colors are guesses; all: leave out none.
+
+    Where nothing else is, other views then show the background.
+    """
+    seen = blending_weights(gaussians, inputs.cameras, inputs.masks) >= SEEN
+    return gaussians.keep(seen) if seen.any() else gaussians
 
 
 @dataclass(frozen=True)

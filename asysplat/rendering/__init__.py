@@ -7,7 +7,7 @@ from asysplat.rendering.interface import (
     BlendingLimits,
     Projections,
 )
-from asysplat.rendering.render import Rendering, render
+from asysplat.rendering.render import Rendering, blending_weights, render
 
 __all__ = [
     "BLENDING_LIMITS",
@@ -16,5 +16,6 @@ __all__ = [
     "BlendingLimits",
     "Projections",
     "Rendering",
+    "blending_weights",
     "render",
 ]

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.kernels.dispatch import (
     check_device,
     check_float,
@@ -175,6 +176,19 @@ def render(
         if background is not None:
             image = image + transmittance[..., None, :, :] * background.to(dtype)[..., None, None]
         return Rendering(image, alpha, distance, out.stats, projected)
+
+
+def blending_weights(
+    gaussians: Gaussians, cameras: Cameras, masks: Bool[Tensor, "V H W"] | None = None
+) -> Float[Tensor, "N"]:
+    """Compute the sum of each Gaussian's blending weights over all pixels of all views."""
+    # An image is linear in the Gaussians' colors, with these weights as its gradient.
+    gray = torch.zeros_like(gaussians.sh[:, :1], requires_grad=True)
+    with torch.enable_grad():
+        scene = replace(gaussians, sh=gray)
+        rendering = render(scene, cameras, depth=False, masks=masks, views_at_once=1)
+        (gradient,) = torch.autograd.grad(rendering.image[:, 0].sum(), gray)
+    return gradient[:, 0, 0] / SH_C0
 
 
 def _depth(depth: Tensor, out: RenderOutputs, kind: str | None) -> Tensor:

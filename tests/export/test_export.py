@@ -1,7 +1,6 @@
 """The command that writes a scene in another format."""
 
 import json
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,9 +10,8 @@ from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.export.__main__ import export
 from asysplat.export.gaussians import CAMERAS, Notes
-from asysplat.export.importance import blending_weights, most_important, without_unseen
-from asysplat.geometry.spherical_harmonics import SH_C0
-from asysplat.scene import Views
+from asysplat.export.importance import most_important
+from asysplat.rendering import blending_weights
 
 
 @pytest.fixture
@@ -31,17 +29,6 @@ def file(scene, tmp_path):
     return tmp_path / "scene.ply"
 
 
-def test_blending_weights_are_what_a_white_gaussian_adds_to_black_ones(scene):
-    gaussians, cameras = scene
-    weights = blending_weights(gaussians, cameras)
-    sh = torch.full((60, 1, 3), -0.5 / SH_C0)
-    for index in (0, 17, 59):
-        sh[index] *= -1
-        expected = render(replace(gaussians, sh=sh), cameras).image[:, 0].sum()
-        torch.testing.assert_close(weights[index], expected, rtol=1e-4, atol=1e-4)
-        sh[index] *= -1
-
-
 def test_the_most_important_gaussians_are_kept_in_their_order(scene):
     gaussians, cameras = scene
     kept = most_important(gaussians, 0.5, cameras)
@@ -55,24 +42,6 @@ def test_the_most_important_gaussians_are_kept_in_their_order(scene):
 
     least = gaussians.keep(weights < weights.median())
     assert difference(kept) < 0.2 * difference(least)
-
-
-def test_what_no_pixel_of_a_photograph_shows_is_left_out(scene):
-    gaussians, cameras = scene
-    gaussians.means[:20, 2] *= -1  # behind the cameras
-    images = render(gaussians, cameras).image
-    kept = without_unseen(gaussians, Views(cameras, images))
-    assert torch.equal(kept.means, gaussians.means[20:])
-
-    left = torch.zeros_like(images[:, 0], dtype=torch.bool)
-    left[..., : left.shape[-1] // 2] = True
-    seen_left = without_unseen(gaussians, Views(cameras, images, masks=left))
-    assert 0 < seen_left.num_gaussians < 40
-    difference = (render(seen_left, cameras).image - images).abs().amax(1)
-    assert difference[left].max() < 0.01 < difference[~left].max()
-
-    nothing = Views(cameras, images, masks=torch.zeros_like(left))
-    assert without_unseen(gaussians, nothing) is gaussians
 
 
 def test_a_scene_is_written_and_measured(file, capsys):

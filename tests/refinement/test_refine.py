@@ -25,6 +25,7 @@ from asysplat.refinement import (
     StepSchedule,
     for_views,
     refine,
+    without_unseen,
 )
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
 from asysplat.refinement.densification.spawn import MIN_OPACITY
@@ -457,3 +458,21 @@ def test_max_steps_per_image_ends_the_refinement():
     settings = replace(DEFAULT, max_steps_per_image=5, views_per_step=None, densify="none")
     _, records = watched(scene, views, settings, seconds=1000)
     assert records[-1].step == 5  # a step with all views counts for each
+
+
+def test_what_no_pixel_of_a_photograph_shows_is_left_out(make_scene):
+    gaussians, cameras = make_scene(60, 3, height=26, width=34, dtype=torch.float32)
+    gaussians.means[:20, 2] *= -1  # behind the cameras
+    images = render(gaussians, cameras).image
+    kept = without_unseen(gaussians, Views(cameras, images))
+    assert torch.equal(kept.means, gaussians.means[20:])
+
+    left = torch.zeros_like(images[:, 0], dtype=torch.bool)
+    left[..., : left.shape[-1] // 2] = True
+    seen_left = without_unseen(gaussians, Views(cameras, images, masks=left))
+    assert 0 < seen_left.num_gaussians < 40
+    difference = (render(seen_left, cameras).image - images).abs().amax(1)
+    assert difference[left].max() < 0.01 < difference[~left].max()
+
+    nothing = Views(cameras, images, masks=torch.zeros_like(left))
+    assert without_unseen(gaussians, nothing) is gaussians

@@ -8,7 +8,7 @@ from textbook import textbook_alphas
 
 from asysplat.errors import InputError
 from asysplat.geometry.spherical_harmonics import SH_C0
-from asysplat.rendering import INRIA, render
+from asysplat.rendering import INRIA, blending_weights, render
 from asysplat.rendering.reference import rasterize
 
 
@@ -80,3 +80,14 @@ def test_a_render_in_a_cuda_graph_is_an_error(make_scene, monkeypatch):
     gaussians.means.fill_(torch.nan)  # validation would wait for the GPU
     with pytest.raises(InputError, match=r"waits for the GPU.* call it outside torch.cuda.graph.$"):
         render(gaussians, cameras, validate=True)
+
+
+def test_blending_weights_are_what_a_white_gaussian_adds_to_black_ones(make_scene):
+    gaussians, cameras = make_scene(count=60, views=3, degree=2, dtype=torch.float32)
+    weights = blending_weights(gaussians, cameras)
+    sh = torch.full((60, 1, 3), -0.5 / SH_C0)
+    for index in (0, 17, 59):
+        sh[index] *= -1
+        expected = render(replace(gaussians, sh=sh), cameras).image[:, 0].sum()
+        torch.testing.assert_close(weights[index], expected, rtol=1e-4, atol=1e-4)
+        sh[index] *= -1
