@@ -1,8 +1,7 @@
 """Feed-forward 3D Gaussian splatting of long image sequences with asymmetric branches.
 
 photographs = asysplat.open_photographs("my_scene", height=128, width=128, views=8)
-gaussians = asysplat.load("shipped")(photographs.inputs)
-gaussians = asysplat.refine(gaussians, photographs.inputs, seconds=10.0)
+gaussians = asysplat.predict(photographs.inputs, seconds=10.0)
 asysplat.write_gaussians("scene.ply", photographs.normalization.to_world(gaussians))
 """
 
@@ -14,6 +13,7 @@ LATER = {
     "Views": "asysplat.scene",
     "load": "asysplat.load",
     "open_photographs": "asysplat.data.photographs",
+    "predict": "asysplat.refinement",
     "read_gaussians": "asysplat.export",
     "refine": "asysplat.refinement",
     "render": "asysplat.rendering",

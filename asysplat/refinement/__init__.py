@@ -1,6 +1,7 @@
 """Fit the Gaussians of one scene to its images: initialization, merging, refinement."""
 
 from asysplat.refinement.init import merge_to_limit
+from asysplat.refinement.predict import predict
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine, without_unseen
 from asysplat.refinement.scaffold_gs import (
     SCAFFOLD_GS,
@@ -9,6 +10,7 @@ from asysplat.refinement.scaffold_gs import (
     refine_scaffold,
 )
 from asysplat.refinement.settings import (
+    BRIEF,
     DEFAULT,
     FEW,
     PAPER,
@@ -20,6 +22,7 @@ from asysplat.refinement.settings import (
 )
 
 __all__ = [
+    "BRIEF",
     "DEFAULT",
     "FEW",
     "PAPER",
@@ -33,6 +36,7 @@ __all__ = [
     "StepSchedule",
     "for_views",
     "merge_to_limit",
+    "predict",
     "refine",
     "refine_scaffold",
     "with_options",

@@ -43,7 +43,7 @@ class StepSchedule:
 
 @dataclass(frozen=True, config=configured("refinement"))
 class RefinementSettings:
-    """Settings of a refinement; `DEFAULT` is ours, `FEW` for few views, `PAPER` the paper's.
+    """Settings of a refinement; `DEFAULT` is ours, `PAPER` the paper's, `FEW` for few views.
 
     Raises:
         pydantic.ValidationError: a number out of range.
@@ -129,4 +129,5 @@ def with_options(config: DictConfig, file: str, given: Iterable[str]) -> DictCon
 DEFAULT: RefinementSettings = read_settings("default")
 PAPER: RefinementSettings = read_settings("default", "paper")
 FEW: RefinementSettings = read_settings("default", "few")
+BRIEF: RefinementSettings = read_settings("default", "brief")
 PUBLISHED_3DGS: RefinementSettings = read_settings("default", "3dgs")

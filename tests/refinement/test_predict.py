@@ -1,0 +1,50 @@
+"""Gaussians of photographs in so many seconds."""
+
+import sys
+
+import pytest
+
+from asysplat.errors import InputError
+from asysplat.evaluation.metrics import psnr
+from asysplat.refinement import BRIEF, DEFAULT, FEW, predict, refine
+from asysplat.refinement.init import initial_gaussians
+from asysplat.rendering import render
+
+
+def held_out_psnr(scene, room):
+    inputs, held_out = room
+    image = render(scene, held_out.cameras, inputs.mean_color()).image.clamp(0, 1)
+    return psnr(image, held_out.images).mean().item()
+
+
+@pytest.mark.medium
+def test_few_steps_gain_more_where_they_are_all_there_is(room):
+    values = []
+    for settings in (BRIEF, DEFAULT):
+        start = initial_gaussians("plane_sweep", room[0], settings.initial_limit)
+        values.append(held_out_psnr(refine(start, room[0], settings, steps=20), room))
+    assert values[0] > values[1] + 1, values
+
+
+@pytest.mark.parametrize(
+    "seconds, count, expected", [(1, 12, BRIEF), (8, 12, DEFAULT), (8, 4, FEW)]
+)
+def test_the_time_and_the_views_choose_the_settings(monkeypatch, room, seconds, count, expected):
+    taken = []
+
+    def record(start, views, settings, **options):
+        taken.append((settings, options))
+        return start
+
+    monkeypatch.setattr(sys.modules["asysplat.refinement.predict"], "refine", record)
+    scene = predict(room[0].select(list(range(count))), seconds, seed=3)
+    ((settings, options),) = taken
+    assert settings == expected and options["seed"] == 3 and 0 < options["seconds"] < seconds
+    assert scene.num_gaussians <= settings.initial_limit
+
+
+def test_without_time_for_a_step_it_is_the_plane_sweep(room):
+    start = initial_gaussians("plane_sweep", room[0], BRIEF.initial_limit)
+    assert predict(room[0], 1e-9).means.equal(start.means)
+    with pytest.raises(InputError, match="seconds"):
+        predict(room[0], 0)
