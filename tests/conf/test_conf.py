@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.refinement import DEFAULT, FEW, PAPER, PUBLISHED_3DGS, SCAFFOLD_GS
+from asysplat.refinement import BRIEF, DEFAULT, FEW, PAPER, PUBLISHED_3DGS, SCAFFOLD_GS
 from paper.tables import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ def test_a_choice_composes_and_builds_its_model(build, choice):
 def test_hydra_and_the_code_read_the_same_refinements(composed):
     names = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
     coded = {"default": DEFAULT, "few": FEW, "paper": PAPER, "3dgs": PUBLISHED_3DGS}
-    coded |= {"scaffold_gs": SCAFFOLD_GS}
+    coded |= {"scaffold_gs": SCAFFOLD_GS, "brief": BRIEF}
     assert names == coded.keys()
     for name, expected in coded.items():
         config = composed(f"refinement={name}", script="reconstruct")
