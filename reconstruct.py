@@ -115,15 +115,15 @@ def reconstruct(config: DictConfig) -> None:
             results.save(anchors, display.last)
             results.save_video(anchors)
             return
-        gaussians = refine(gaussians, fitted.inputs, settings, **options)
-        gaussians = without_unseen(gaussians, fitted.inputs)
+        refined = refine(gaussians, fitted.inputs, settings, **options)
+        gaussians = without_unseen(refined, fitted.inputs)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
         fits_all = photographs.held_out is not None and not photographs.is_split
         if config.last_fit and fits_all and not display.stopped:
             gaussians = fit_to_all(
-                gaussians, photographs, exposures, settings, config.last_fit, options
+                refined, photographs, exposures, settings, config.last_fit, options
             )
             results.save_scene(gaussians)
         results.save_video(gaussians)

@@ -30,9 +30,8 @@ def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gauss
     """
     began = time.perf_counter()
     check_options({"seconds": seconds}, {"seconds": Positive})
-    settings = FEW if views.num_views <= DEFAULT.few_views else DEFAULT
-    if seconds < BRIEF_UNTIL:
-        settings = BRIEF
+    at_length = FEW if views.num_views <= DEFAULT.few_views else DEFAULT
+    settings = BRIEF if seconds < BRIEF_UNTIL else at_length
     gaussians = initial_gaussians("plane_sweep", views, settings.initial_limit)
     left = seconds - (time.perf_counter() - began)
     return refine(gaussians, views, settings, seconds=left, seed=seed) if left > 0 else gaussians

@@ -181,14 +181,17 @@ def render(
 def blending_weights(
     gaussians: Gaussians, cameras: Cameras, masks: Bool[Tensor, "V H W"] | None = None
 ) -> Float[Tensor, "N"]:
-    """Compute the sum of each Gaussian's blending weights over all pixels of all views."""
+    """Compute the sum of each Gaussian's blending weights over all pixels, or those in masks."""
     # An image is linear in the Gaussians' colors, with these weights as its gradient.
     gray = torch.zeros_like(gaussians.sh[:, :1], requires_grad=True)
     with torch.enable_grad():
         scene = replace(gaussians, sh=gray)
-        rendering = render(scene, cameras, depth=False, masks=masks, views_at_once=1)
-        (gradient,) = torch.autograd.grad(rendering.image[:, 0].sum(), gray)
-    return gradient[:, 0, 0] / SH_C0
+        for view in range(cameras.num_views):  # the images of all views would take much memory
+            of_view = None if masks is None else masks[view : view + 1]
+            rendering = render(scene, cameras.select([view]), depth=False, masks=of_view)
+            rendering.image[:, 0].sum().backward(inputs=gray)
+    assert gray.grad is not None
+    return gray.grad[:, 0, 0] / SH_C0
 
 
 def _depth(depth: Tensor, out: RenderOutputs, kind: str | None) -> Tensor:
