@@ -7,6 +7,7 @@ import math
 import os
 import signal
 import sys
+import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,7 +48,6 @@ from asysplat.reconstruct.video import find_views
 from asysplat.refinement import (
     RefinementSettings,
     ScaffoldSettings,
-    for_views,
     refine,
     refine_scaffold,
     with_options,
@@ -55,9 +55,10 @@ from asysplat.refinement import (
 )
 from asysplat.refinement.exposure import even_exposures, find_exposures
 from asysplat.refinement.init import INITS, initial_gaussians
+from asysplat.refinement.trial import CLEAR_GAIN, TRIAL_FROM, TRIAL_VIEWS, trial_gain
 from asysplat.root import typed
 from asysplat.runs.machine import find_device
-from asysplat.scene import Gaussians
+from asysplat.scene import Gaussians, Views
 from asysplat.terminal import make_console
 
 RANGES = {"last_fit": Fraction, "exposure": Literal["auto", "given"]}
@@ -88,12 +89,6 @@ def reconstruct(config: DictConfig) -> None:
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
-    if "refinement" not in given_options():
-        given = (name.partition("refinement.")[2] for name in given_options())
-        few = for_views(config.refinement, photographs.inputs.num_views, filter(None, given))
-        if few != config.refinement:
-            print("few photographs: refinement=few; to avoid it, refinement=default")
-            config.refinement, settings = few, instantiate(few)
     # an error of names comes before the work
     find_views(config.video, photographs.input_files, photographs.held_out_files)
     print(describe(config, photographs, limit))
@@ -104,6 +99,9 @@ def reconstruct(config: DictConfig) -> None:
         most = (exposures.mean(-1).max() - exposures.mean(-1).min()).exp().item()
         print(f"exposure: some photographs are {most:.1f} times as bright as others (exposure=)")
         fitted = replace(photographs, inputs=even_exposures(photographs.inputs, exposures))
+    if "refinement" not in given_options():
+        limit = choose_refinement(config, fitted.inputs, limit)
+        settings = instantiate(config.refinement)
     gaussians = initialize(config, fitted, settings)
     background = photographs.background
     results.save_start(gaussians, photographs, background, exposures)
@@ -208,6 +206,33 @@ def read_limit(config: DictConfig) -> dict[str, float]:
     name = "seconds" if config.steps is None else "steps"
     check_options({name: config[name]}, {"seconds": Positive, "steps": Count})
     return {name: config.steps or float(config.seconds)}
+
+
+def choose_refinement(
+    config: DictConfig, inputs: Views, limit: dict[str, float]
+) -> dict[str, float]:
+    """Set the options for few photographs where there are few, unless a trial says otherwise.
+
+    Returns the limit without the seconds of the trial.
+    """
+    began = time.perf_counter()
+    given = (name.partition("refinement.")[2] for name in given_options())
+    few = with_options(config.refinement, "refinement/few", filter(None, given))
+    takes_few = inputs.num_views <= config.refinement.few_views
+    why = "few photographs" if takes_few else ""
+    ((name, amount),) = limit.items()
+    may_differ = config.decide and config.refinement.few_views > 0
+    if may_differ and inputs.num_views in TRIAL_VIEWS and amount >= TRIAL_FROM[name]:
+        gain = trial_gain(inputs, instantiate(config.refinement), instantiate(few), config.seed)
+        takes_few = gain > (-CLEAR_GAIN if takes_few else CLEAR_GAIN)
+        why = f"photographs that sat out a trial, {gain:+.1f} dB by refinement=few (decide=)"
+        if name == "seconds":
+            limit = {name: amount - (time.perf_counter() - began)}
+    if why:
+        print(f"{why}: refinement={'few' if takes_few else 'default'}, unless you name another")
+    if takes_few:
+        config.refinement = few
+    return limit
 
 
 def initialize(

@@ -467,6 +467,35 @@ def test_one_limit_above_0_is_given(script, monkeypatch, steps, seconds, message
         script.read_limit(OmegaConf.create({"steps": steps, "seconds": seconds}))
 
 
+@pytest.mark.parametrize(
+    ("count", "limit", "decide", "gain", "takes_few"),
+    [
+        (9, {"seconds": 59.0}, True, -1.0, True),
+        (10, {"steps": 999}, True, 1.0, False),
+        (9, {"seconds": 60.0}, False, -1.0, True),
+        (9, {"seconds": 60.0}, True, -0.2, True),
+        (9, {"seconds": 60.0}, True, -0.4, False),
+        (10, {"steps": 1000}, True, 0.2, False),
+        (10, {"steps": 1000}, True, 0.4, True),
+        (7, {"steps": 1000}, True, -1.0, True),
+    ],
+)
+def test_a_trial_decides_whether_photographs_are_few(
+    script, monkeypatch, capsys, views, count, limit, decide, gain, takes_few
+):
+    monkeypatch.setattr(script, "given_options", lambda: {"path", "refinement.ssim"})
+    monkeypatch.setattr(script, "trial_gain", lambda *_: gain)
+    options = OmegaConf.load(CONF / "refinement" / "default.yaml")
+    config = OmegaConf.create({"refinement": options, "decide": decide, "seed": 0})
+    left = script.choose_refinement(config, views.select(list(range(count))), limit)
+    assert config.refinement.opacity_decay == (FEW if takes_few else DEFAULT).opacity_decay
+    assert config.refinement.ssim == DEFAULT.ssim
+    tried = decide and count >= 8 and limit in ({"seconds": 60.0}, {"steps": 1000})
+    said = capsys.readouterr().out
+    assert ("sat out" in said) == tried and ("refinement=few" in said) == (tried or takes_few)
+    assert left.keys() == limit.keys() and (left == limit) == (not tried or "steps" in limit)
+
+
 def test_run_last_without_any_run_names_the_folder(tmp_path):
     config = OmegaConf.create({"run": "last", "paths": {"logs": f"{tmp_path}/nowhere"}})
     with pytest.raises(InputError, match=r"run=last found no finished run in .*nowhere"):
