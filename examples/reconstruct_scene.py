@@ -1,4 +1,4 @@
-"""From photographs to Gaussians in Python: load, predict, refine, render, write.
+"""From photographs to Gaussians in Python: open, predict, render, write.
 
 python examples/reconstruct_scene.py [my_scene]
 """
@@ -7,9 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-import torch
-
-from asysplat import load, open_photographs, refine, render, write_gaussians
+from asysplat import open_photographs, predict, render, write_gaussians
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation.figures import comparison_figure
@@ -18,14 +16,11 @@ from asysplat.interrupts import handle_signals
 
 def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
     photographs = open_photographs(folder, height=128, width=128, views=8)
-    with torch.no_grad():
-        start = load("shipped")(photographs.inputs)
-    background = photographs.background
-    gaussians = refine(start, photographs.inputs, seconds=10.0, background=background)
+    gaussians = predict(photographs.inputs, seconds=10.0)
     world = photographs.normalization.to_world(gaussians)  # the world of the files
     write_gaussians(scene, world)
 
-    rendering = render(gaussians, photographs.held_out.cameras, background)
+    rendering = render(gaussians, photographs.held_out.cameras, photographs.background)
     comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(figure, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; figure: {figure}")
 

@@ -40,9 +40,11 @@ def test_it_draws_a_figure(run_example, tmp_path, capsys, name):
 
 @pytest.fixture
 def few_steps(monkeypatch):
-    """A refinement of seconds takes a few steps."""
+    """A prediction in so many seconds takes a few steps."""
     monkeypatch.setattr(
-        "asysplat.refine", lambda *given, seconds, **more: refine(*given, steps=5, **more)
+        sys.modules["asysplat.refinement.predict"],
+        "refine",
+        lambda *given, seconds, **more: refine(*given, steps=5, **more),
     )
 
 

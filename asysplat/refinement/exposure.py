@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.kernels.dispatch import to_float64
-from asysplat.models.prior import PlaneSweepPrior
-from asysplat.refinement.init import MIN_CONFIDENCE, depth_views
+from asysplat.refinement.init import MIN_CONFIDENCE, depth_views, sweep
 from asysplat.scene import Cameras, Views
 
 CLIPPED = 0.99  # least color that may have been brighter
@@ -84,8 +83,7 @@ def predict_exposures(
 
 def _compare(views: Views) -> Iterator[tuple[tuple[int, int], Float[Tensor, "places 3"]]]:
     """Yield pairs of photographs, and the log ratios of their colors at places that both show."""
-    swept = depth_views(views)
-    estimate = PlaneSweepPrior().sweep(views.select(swept).map(lambda tensor: tensor[None]))
+    swept, estimate = depth_views(views), sweep(views)
     inverse, known = estimate.inverse_depth[0], estimate.confidence[0] > MIN_CONFIDENCE
     known &= inverse > 0
     small, rows = views.resized(*inverse.shape[-2:]), {view: row for row, view in enumerate(swept)}

@@ -14,6 +14,7 @@ from asysplat.errors import InputError
 from asysplat.kernels.dispatch import to_float64
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
+from asysplat.models.prior.prior import DepthEstimate
 from asysplat.refinement.hull import within_hull
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.rendering import INRIA
@@ -27,6 +28,8 @@ MIN_CONFIDENCE = 0.5  # least of a depth that is kept
 MAX_ERROR = 0.5  # difference of log depths beyond which nothing is pulled: the sweep may be wrong
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
 POINT_OPACITY = 0.1
+SPREAD = 0.5  # standard deviation of a Gaussian, in sides of the cell that it covers
+PIXEL_SPREAD = 0.18  # the same, in pixels, where those of other views lie between
 
 
 @torch.no_grad()
@@ -36,12 +39,13 @@ def initial_gaussians(
     limit: int,
     points: Float[Tensor, "P 3"] | None = None,
     network: Network | None = None,
+    estimate: DepthEstimate | None = None,
 ) -> Gaussians:
     """Build the Gaussians that a refinement starts from, `limit` at most, in the frame of `inputs`.
 
     Of many views, those of DEPTH_VIEWS: more would be merged in larger cells. Gaussians of several
     views on the same surface are merged, in cells of a pixel of the network's input or of the
-    prior's depth map, or larger ones.
+    prior's depth map, or larger ones. An `estimate` is that of `sweep`, for init=plane_sweep.
     """
     pixels = 1.0
     views = inputs.select(depth_views(inputs))
@@ -66,8 +70,11 @@ def initial_gaussians(
         stride = -(-longest // PRIOR_MAX_SIDE)
         small = _shrink(views, longest, stride)
         size = small.cameras.height // stride, small.cameras.width // stride
-        run_prior = PlaneSweepPrior() if init == "plane_sweep" else DepthPrior()
-        prior = run_prior(small.map(lambda tensor: tensor[None]), size)
+        batch = small.map(lambda tensor: tensor[None])
+        if init == "depth":
+            prior = DepthPrior()(batch, size)
+        else:
+            prior = Prior.from_estimate(estimate or sweep(inputs), batch, size)
         gaussians = gaussians_from_prior(views, prior)
         pixels = longest / max(prior.distance.shape[-2:])
     else:
@@ -75,6 +82,26 @@ def initial_gaussians(
     if inputs.alphas is not None:
         gaussians = within_hull(gaussians, inputs)
     return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), limit)
+
+
+@torch.no_grad()
+def sweep(views: Views) -> DepthEstimate:
+    """Estimate the depths of DEPTH_VIEWS at most, [1, V], by a plane sweep."""
+    return PlaneSweepPrior().sweep(views.select(depth_views(views)).map(lambda x: x[None]))
+
+
+@torch.no_grad()
+def gaussians_of_pixels(views: Views, estimate: DepthEstimate) -> Gaussians:
+    """Place a Gaussian at the surface point of each pixel of the `sweep` of views.
+
+    They are drawn as they are: merged ones are blurred until steps sharpen them.
+    """
+    some = views.select(depth_views(views))
+    height, width = estimate.inverse_depth.shape[-2:]
+    batch = some.map(lambda tensor: tensor[None])
+    prior = Prior.from_estimate(estimate, batch, (height, width))
+    gaussians = gaussians_from_prior(some, prior, PIXEL_SPREAD)
+    return gaussians if views.alphas is None else within_hull(gaussians, views)
 
 
 class KnownDepths:
@@ -85,11 +112,9 @@ class KnownDepths:
 
     @torch.no_grad()
     def __init__(self, views: Views):
-        chosen = depth_views(views)
-        some = views.select(chosen).map(lambda tensor: tensor[None])
-        sweep = PlaneSweepPrior().sweep(some)
-        self._maps = torch.stack((sweep.inverse_depth[0], sweep.confidence[0]), dim=1)
-        self._rows = {view: row for row, view in enumerate(chosen)}
+        found = sweep(views)
+        self._maps = torch.stack((found.inverse_depth[0], found.confidence[0]), dim=1)
+        self._rows = {view: row for row, view in enumerate(depth_views(views))}
 
     def error(self, depth: Float[Tensor, "1 H W"], view: int) -> Tensor:
         """Compute the mean error of a view's log depths by confidence, 0 where it is below .5.
@@ -109,9 +134,10 @@ def depth_views(views: Views) -> list[int]:
     return evenly_spaced(range(views.num_views), min(DEPTH_VIEWS, views.num_views))
 
 
-def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
+def gaussians_from_prior(views: Views, prior: Prior, spread: float = SPREAD) -> Gaussians:
     """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
 
+    Its standard deviation is `spread` pixels of these.
     Those of opacities that are too small to be drawn are left out, unless that is all of them.
     """
     size = tuple(prior.distance.shape[-2:])
@@ -121,7 +147,7 @@ def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
     colors = F.interpolate(views.images, size, mode="area").movedim(1, -1)
     gaussians = isotropic_gaussians(
         (origins + distance[..., None] * directions).flatten(0, 2),
-        (distance / cameras.intrinsics[:, 0, 0, None, None] * SPREAD).flatten(),
+        (distance / cameras.intrinsics[:, 0, 0, None, None] * spread).flatten(),
         prior.opacity[0].to(directions).flatten(),
         colors.flatten(0, 2),
     )
@@ -174,7 +200,6 @@ def _shrink(views: Views, longest: int, multiple: int) -> Views:
     return views.resized(*size)
 
 
-SPREAD = 0.5  # standard deviation of a Gaussian, in sides of the cell that it covers
 MIN_OPACITY, MAX_OPACITY = 0.05, 0.95  # range of merged opacities, so that they keep a gradient
 CELL_GROWTH = 2**0.5  # factor by which cells grow until few enough Gaussians are left
 

@@ -3,7 +3,7 @@
 import time
 
 from asysplat.ranges import Positive, check_options
-from asysplat.refinement.init import initial_gaussians
+from asysplat.refinement.init import gaussians_of_pixels, initial_gaussians, sweep
 from asysplat.refinement.refine import refine
 from asysplat.refinement.settings import BRIEF, DEFAULT, FEW
 from asysplat.scene import Gaussians, Views
@@ -12,13 +12,15 @@ BRIEF_UNTIL = 5.0  # seconds, of two cores and 128x128 pixels, from which densif
 
 
 def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gaussians:
-    """Compute the Gaussians of a scene: the plane sweep's, refined for the time that is left.
+    """Compute the Gaussians of a scene: a plane sweep's, refined for the time that is left.
+
+    Where that is less than the sweep took, they are one for each pixel of the views instead.
 
     The first call in a process compiles its kernels beside these seconds.
 
     Args:
         views: the photographs, [V].
-        seconds: > 0; without time for a step, the Gaussians are those of the plane sweep.
+        seconds: > 0; the sweep takes its time in any case.
         seed: see `Refinement`.
 
     Raises:
@@ -32,6 +34,11 @@ def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gauss
     check_options({"seconds": seconds}, {"seconds": Positive})
     at_length = FEW if views.num_views <= DEFAULT.few_views else DEFAULT
     settings = BRIEF if seconds < BRIEF_UNTIL else at_length
-    gaussians = initial_gaussians("plane_sweep", views, settings.initial_limit)
-    left = seconds - (time.perf_counter() - began)
-    return refine(gaussians, views, settings, seconds=left, seed=seed) if left > 0 else gaussians
+    views = views.validate("predict's views").decoded()
+    estimate = sweep(views)
+    if seconds < 2 * (time.perf_counter() - began):
+        return gaussians_of_pixels(views, estimate)
+    limit = settings.initial_limit
+    start = initial_gaussians("plane_sweep", views, limit, estimate=estimate)
+    left = max(1e-3, seconds - (time.perf_counter() - began))
+    return refine(start, views, settings, seconds=left, seed=seed)

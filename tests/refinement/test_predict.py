@@ -7,7 +7,7 @@ import pytest
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import BRIEF, DEFAULT, FEW, predict, refine
-from asysplat.refinement.init import initial_gaussians
+from asysplat.refinement.init import gaussians_of_pixels, initial_gaussians, sweep
 from asysplat.rendering import render
 
 
@@ -43,8 +43,12 @@ def test_the_time_and_the_views_choose_the_settings(monkeypatch, room, seconds, 
     assert scene.num_gaussians <= settings.initial_limit
 
 
-def test_without_time_for_a_step_it_is_the_plane_sweep(room):
-    start = initial_gaussians("plane_sweep", room[0], BRIEF.initial_limit)
-    assert predict(room[0], 1e-9).means.equal(start.means)
+def test_without_time_for_steps_it_is_the_plane_sweep_unmerged(room):
+    sharp, estimate = predict(room[0], 1e-9), sweep(room[0])
+    assert sharp.means.equal(gaussians_of_pixels(room[0], estimate).means)
+    limit = BRIEF.initial_limit
+    merged = initial_gaussians("plane_sweep", room[0], limit, estimate=estimate)
+    assert merged.means.equal(initial_gaussians("plane_sweep", room[0], limit).means)
+    assert held_out_psnr(sharp, room) > held_out_psnr(merged, room) + 1
     with pytest.raises(InputError, match="seconds"):
         predict(room[0], 0)
