@@ -223,9 +223,11 @@ def choose_refinement(
     ((name, amount),) = limit.items()
     may_differ = config.decide and config.refinement.few_views > 0
     if may_differ and inputs.num_views in TRIAL_VIEWS and amount >= TRIAL_FROM[name]:
-        gain = trial_gain(inputs, instantiate(config.refinement), instantiate(few), config.seed)
-        takes_few = gain > (-CLEAR_GAIN if takes_few else CLEAR_GAIN)
-        why = f"photographs that sat out a trial, {gain:+.1f} dB by refinement=few (decide=)"
+        settings = instantiate(config.refinement), instantiate(few)
+        gain, error = trial_gain(inputs, *settings, config.seed)
+        if abs(gain) > max(CLEAR_GAIN, error):
+            takes_few = gain > 0
+        why = f"trial (decide=), {gain:+.1f} +- {error:.1f} dB by refinement=few"
         if name == "seconds":
             limit = {name: amount - (time.perf_counter() - began)}
     if why:

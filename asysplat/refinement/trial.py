@@ -9,7 +9,7 @@ from asysplat.scene import Views
 
 TRIAL_VIEWS = range(8, 33)  # fewer photographs can spare none; of more, the default suits all
 TRIAL_FROM = {"seconds": 60, "steps": 1000}  # of a refinement, of which a trial takes a twentieth
-CLEAR_GAIN = 0.3  # dB: less may be chance
+CLEAR_GAIN = 0.3  # dB: less, or less than its standard error, may be chance
 SITTING_OUT = 4  # one photograph in so many: with one in eight two trials differ by up to .6 dB
 SIDE = 64  # greatest side in pixels: of small photographs a short refinement ends as a long one
 STEPS = 200  # of each refinement
@@ -17,8 +17,10 @@ STEPS = 200  # of each refinement
 
 def trial_gain(
     views: Views, settings: RefinementSettings, others: RefinementSettings, seed: int = 0
-) -> float:
-    """Compute the gain in PSNR, in dB, by other settings, of views that sit out a refinement.
+) -> tuple[float, float]:
+    """Compute the gain in PSNR by other settings, in dB, of views that sit out a refinement.
+
+    Returns the mean gain of these views, and its standard error.
 
     Args:
         views: the input views, [V], V in TRIAL_VIEWS; they stay as they are.
@@ -35,4 +37,5 @@ def trial_gain(
         refined = refine(start, rest, tried, steps=STEPS, background=background, seed=seed)
         image = render(refined, target.cameras, background, masks=target.masks).image
         errors.append((target.masked(image) - target.images).square().mean((-3, -2, -1)))
-    return 10 * (errors[0] / errors[1]).log10().mean().item()
+    gains = 10 * (errors[0] / errors[1]).log10()
+    return gains.mean().item(), gains.std().item() / count**0.5

@@ -19,10 +19,10 @@ def short(monkeypatch):
 
 def test_better_settings_gain_what_worse_ones_lose_and_again(short, room):
     views = room[0]
-    gain = trial_gain(views, FADING, BRIEF)
-    assert gain > 1 and trial_gain(views, FADING, BRIEF) == gain
-    assert trial_gain(views, BRIEF, FADING) == pytest.approx(-gain)
-    assert trial_gain(views, BRIEF, BRIEF) == 0
+    gain, error = trial_gain(views, FADING, BRIEF)
+    assert gain > 1 > error > 0 and trial_gain(views, FADING, BRIEF) == (gain, error)
+    assert trial_gain(views, BRIEF, FADING) == pytest.approx((-gain, error))
+    assert trial_gain(views, BRIEF, BRIEF) == (0, 0)
 
 
 def test_what_sits_out_measures_and_is_given_back(short, monkeypatch, room):
