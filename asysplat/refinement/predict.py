@@ -9,12 +9,13 @@ from asysplat.refinement.settings import BRIEF, DEFAULT, FEW
 from asysplat.scene import Gaussians, Views
 
 BRIEF_UNTIL = 5.0  # seconds, of two cores and 128x128 pixels, from which densification pays
+STEPS_PAY_FROM = 2.2  # times the seconds of the plane sweep, of two cores
 
 
 def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gaussians:
     """Compute the Gaussians of a scene: a plane sweep's, refined for the time that is left.
 
-    Where that is less than the sweep took, they are one for each pixel of the views instead.
+    Where that is hardly as much as the sweep took, they are one for each of its pixels instead.
 
     The first call in a process compiles its kernels beside these seconds.
 
@@ -36,7 +37,7 @@ def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gauss
     settings = BRIEF if seconds < BRIEF_UNTIL else at_length
     views = views.validate("predict's views").decoded()
     estimate = sweep(views)
-    if seconds < 2 * (time.perf_counter() - began):
+    if seconds < STEPS_PAY_FROM * (time.perf_counter() - began):
         return gaussians_of_pixels(views, estimate)
     limit = settings.initial_limit
     start = initial_gaussians("plane_sweep", views, limit, estimate=estimate)
