@@ -19,14 +19,20 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.cli import check_command, command, exit_with_message
 from asysplat.files import check_exists
-from asysplat.overrides import name_path
+from asysplat.interrupts import interrupt_once
+from asysplat.overrides import path_option, split_paths
+from asysplat.reconstruct.scenes import reconstruct_scenes
 
 if __name__ == "__main__":
-    sys.argv[1:] = name_path(sys.argv[1:])
+    paths, words = split_paths(sys.argv[1:])
+    sys.argv[1:] = [*(path_option("path", path) for path in paths[:1]), *words]
     asked = check_command("reconstruct")
-    if asked is not None and not OmegaConf.is_missing(asked, "path"):
-        with exit_with_message("stopped."):
-            check_exists(Path(asked.path), "a scene, or a folder of scenes")
+    with exit_with_message("stopped."):
+        if asked is not None and len(paths) > 1:
+            interrupt_once()
+            sys.exit(min(1, reconstruct_scenes(paths, words, asked)))
+        if asked is not None and not OmegaConf.is_missing(asked, "path"):
+            check_exists(Path(asked.path), "photographs or a video")
 
 import torch
 from hydra.core.hydra_config import HydraConfig

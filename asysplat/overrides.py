@@ -3,8 +3,9 @@
 import difflib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from itertools import takewhile
 from pathlib import Path
 
 import hydra
@@ -43,11 +44,15 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> DictConf
     return config
 
 
-def name_path(words: list[str]) -> list[str]:
-    """Rewrite the first word of a command line as path=..., unless it is another option."""
-    if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
-        return [f"path={_quote(words[0])}", *words[1:]]
-    return words
+def split_paths(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split a command line after its first words that are paths, not options."""
+    paths = takewhile(lambda x: x[:1] != "-" and ("=" not in x or Path(x).exists()), words)
+    return (found := list(paths)), list(words[len(found) :])
+
+
+def path_option(name: str, path: str) -> str:
+    """Write an option whose value is a path, quoted as Hydra reads it."""
+    return f"{name}={_quote(path)}"
 
 
 def quote_paths(words: Iterable[str]) -> list[str]:
@@ -59,7 +64,7 @@ def quote_paths(words: Iterable[str]) -> list[str]:
             try:
                 _parse(word)
             except InputError:
-                word = f"{key}={_quote(value)}"
+                word = path_option(key, value)
         quoted.append(word)
     return quoted
 
