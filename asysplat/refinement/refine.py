@@ -207,6 +207,7 @@ class Refinement:
         color = torch.rand(3, generator=self._generator, device=view.images.device)
         return view.over(self.background, color), color
 
+    @torch.enable_grad()  # as a prediction is often called without
     def _gradients(
         self,
         target: Views,

@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+import torch
 
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
@@ -41,6 +42,13 @@ def test_the_time_and_the_views_choose_the_settings(monkeypatch, room, seconds, 
     ((settings, options),) = taken
     assert settings == expected and options["seed"] == 3 and 0 < options["seconds"] < seconds
     assert scene.num_gaussians <= settings.initial_limit
+
+
+def test_a_caller_without_gradients_gets_the_same(room):
+    start = initial_gaussians("plane_sweep", room[0], 100)
+    expected = refine(start, room[0], BRIEF, steps=2)
+    with torch.no_grad():
+        assert refine(start, room[0], BRIEF, steps=2).means.equal(expected.means)
 
 
 def test_without_time_for_steps_it_is_the_plane_sweep_unmerged(room):
