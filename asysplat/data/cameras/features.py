@@ -1,7 +1,7 @@
 """Find features of photographs and match them between pairs, in a database of COLMAP."""
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TypeVar
@@ -12,6 +12,7 @@ from rich.progress import Progress
 ALL_PAIRS = 80  # greatest number of photographs of which all pairs are matched
 FOLLOWING = 10  # next photographs that each is matched with, besides those 16, 32, ... further on
 ANCHORS = 40  # evenly spread photographs that are all matched: a sequence may return to a place
+AROUND = 40  # photographs before and after one without a camera that it is then matched with
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
 AnyLens = TypeVar("AnyLens", bound=Hashable)
@@ -30,6 +31,7 @@ class Effort:
 
 
 USUAL = Effort(1600, 4096, 0.0067, guided=False, pair=15)
+FURTHER = replace(USUAL, guided=True, pair=10)
 HARD = Effort(3200, 8192, 0.002, guided=True, pair=10)
 
 
@@ -74,18 +76,41 @@ def match_photographs(
             extraction_options=extraction,
         )
         progress.advance(task, len(chunk))
-    pairs = _pairs(list(lenses))
+    _match(database, _pairs(list(lenses)), effort, progress)
+    return database
+
+
+def match_further(
+    database: Path, names: Sequence[str], without: Sequence[str], progress: Progress
+) -> bool:
+    """Match photographs `without` a camera with more of the others; return whether there are any.
+
+    Of a sequence, they are matched along epipolar lines with those AROUND and with anchors.
+    """
+    order = {name: number for number, name in enumerate(names)}
+    pairs = set()
+    for number in map(order.__getitem__, without):
+        near = range(max(0, number - AROUND), min(len(names), number + AROUND + 1))
+        others = {*near, *_anchors(len(names))} - {number}
+        pairs |= {(min(number, other), max(number, other)) for other in others}
+    pairs -= {(order[first], order[second]) for first, second in _pairs(names)}
+    _match(database, [(names[i], names[j]) for i, j in sorted(pairs)], FURTHER, progress)
+    return len(pairs) > 0
+
+
+def _match(
+    database: Path, pairs: Sequence[tuple[str, str]], effort: Effort, progress: Progress
+) -> None:
     task = progress.add_task("matches", total=len(pairs))
     matching = pycolmap.FeatureMatchingOptions(guided_matching=effort.guided)
     verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=effort.pair)
     verification.ransac.random_seed = SEED
     for chunk in _chunks(pairs, CHUNK**2):
-        listed = work / "pairs.txt"
+        listed = database.with_name("pairs.txt")
         listed.write_text("".join(f"{first} {second}\n" for first, second in chunk))
         pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
         pycolmap.match_image_pairs(database, matching, pairing, verification)
         progress.advance(task, len(chunk))
-    return database
 
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -93,8 +118,12 @@ def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
         return list(combinations(names, 2))
     gaps = {*range(1, FOLLOWING + 1)} | {2**k for k in range(4, len(names).bit_length())}
     near = {(i, i + gap) for i in range(len(names)) for gap in gaps if i + gap < len(names)}
-    anchors = sorted({round(k * (len(names) - 1) / (ANCHORS - 1)) for k in range(ANCHORS)})
-    return [(names[i], names[j]) for i, j in sorted(near | set(combinations(anchors, 2)))]
+    anchors = combinations(_anchors(len(names)), 2)
+    return [(names[i], names[j]) for i, j in sorted(near | set(anchors))]
+
+
+def _anchors(count: int) -> list[int]:
+    return sorted({round(k * (count - 1) / (ANCHORS - 1)) for k in range(ANCHORS)})
 
 
 def _chunks(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:

@@ -16,7 +16,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages, Policy
-from asysplat.data.cameras.features import HARD, SEED, USUAL, Effort, match_photographs
+from asysplat.data.cameras.features import (
+    HARD,
+    SEED,
+    USUAL,
+    Effort,
+    match_further,
+    match_photographs,
+)
 from asysplat.data.cameras.folder import (
     colmap_names,
     digest,
@@ -61,8 +68,9 @@ def find_cameras(
 
     Its images/ are links to the photographs, upright copies of those that are stored turned, or the
     frames of a video; its masks/ are theirs, and what they leave out is not matched; its sparse/0
-    has the cameras and points. A second attempt with weaker features follows where the first finds
-    fewer than 9 of 10 cameras; the better one is returned.
+    has the cameras and points. Where fewer than 9 of 10 cameras are found, the photographs of a
+    sequence that are left are matched with more of the others; if there still are, a second attempt
+    with weaker features follows, and the better one is returned.
 
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
@@ -148,9 +156,36 @@ def _registered(model: pycolmap.Reconstruction | None) -> int:
 def _reconstruct(
     work: Path, lenses: dict[str, tuple], attempt: Attempt, progress: Progress
 ) -> pycolmap.Reconstruction | None:
-    """Return the largest model that can be built; images of the same lens have one camera."""
+    """Return the largest model that can be built; images of the same lens have one camera.
+
+    Of a sequence, those that it left open are matched further, and it goes on with them.
+    """
     database = match_photographs(work, lenses, attempt.effort, progress)
-    task = progress.add_task("cameras", total=len(lenses))
+    model = _map(work, lenses, database, attempt, progress)
+    if model is None or _registered(model) >= ENOUGH * len(lenses):
+        return model
+    found = {image.name for image in model.images.values() if image.has_pose}
+    without = [name for name in lenses if name not in found]
+    if not match_further(database, list(lenses), without, progress):
+        return model
+    further = _map(work, lenses, database, ATTEMPTS[-1], progress, model)
+    return max(model, further, key=_registered)
+
+
+def _map(
+    work: Path,
+    lenses: dict[str, tuple],
+    database: Path,
+    attempt: Attempt,
+    progress: Progress,
+    start: pycolmap.Reconstruction | None = None,
+) -> pycolmap.Reconstruction | None:
+    """Return the largest model of verified matches, from two photographs or a model on."""
+    task = progress.add_task("cameras", total=len(lenses), completed=_registered(start))
+    begun = work / "begun"
+    if start is not None:
+        begun.mkdir(exist_ok=True)
+        start.write(begun)
     options = pycolmap.IncrementalPipelineOptions(
         min_num_matches=attempt.effort.pair, min_model_size=LEAST_PHOTOGRAPHS, random_seed=SEED
     )
@@ -158,6 +193,11 @@ def _reconstruct(
     options.mapper.init_min_tri_angle = attempt.angle
     options.mapper.abs_pose_min_num_inliers = attempt.image
     models = pycolmap.incremental_mapping(
-        database, work / "images", work, options, next_image_callback=lambda: progress.advance(task)
+        database,
+        work / "images",
+        work,
+        options,
+        input_path=begun if start is not None else "",
+        next_image_callback=lambda: progress.advance(task),
     )
     return max(models.values(), key=_registered, default=None)

@@ -165,6 +165,23 @@ def test_pairs_of_long_sequences_are_few_and_connected():
     assert len(features._pairs(names[:30])) == 30 * 29 / 2
 
 
+@pytest.mark.medium
+def test_what_the_pairs_of_a_sequence_leave_open_is_matched_further(views, tmp_path, monkeypatch):
+    save_first(views, COUNT, tmp_path / "scene")
+    pairs = features._pairs
+
+    def some(names):  # the last three with none
+        return pairs([name for name in names if int(name[:-4]) < COUNT - 3])
+
+    monkeypatch.setattr(features, "_pairs", some)
+    monkeypatch.setattr(find, "ATTEMPTS", find.ATTEMPTS[:1])
+    found = find_cameras(tmp_path / "scene", tmp_path / "logs")
+    assert len(read_poses(found / "sparse" / "0")) == COUNT
+    monkeypatch.setattr(find, "match_further", lambda *_: False)
+    found = find_cameras(tmp_path / "scene", tmp_path / "others")
+    assert len(read_poses(found / "sparse" / "0")) == COUNT - 3
+
+
 def test_names_that_differ_by_spaces(views, tmp_path):
     for index, name in enumerate(("a 1.png", "a_1.png", "a  1.png", "b.png")):
         save(views.images[index], tmp_path / "scene" / name)
