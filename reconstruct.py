@@ -21,7 +21,6 @@ from asysplat.cli import check_command, command, exit_with_message
 from asysplat.files import check_exists
 from asysplat.interrupts import interrupt_once
 from asysplat.overrides import path_option, split_paths
-from asysplat.reconstruct.scenes import reconstruct_scenes
 
 if __name__ == "__main__":
     paths, words = split_paths(sys.argv[1:])
@@ -29,6 +28,8 @@ if __name__ == "__main__":
     asked = check_command("reconstruct")
     with exit_with_message("stopped."):
         if asked is not None and len(paths) > 1:
+            from asysplat.reconstruct.scenes import reconstruct_scenes
+
             interrupt_once()
             sys.exit(min(1, reconstruct_scenes(paths, words, asked)))
         if asked is not None and not OmegaConf.is_missing(asked, "path"):

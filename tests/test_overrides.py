@@ -87,6 +87,21 @@ COMMAND = re.compile(
 IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 
 
+def test_the_first_words_are_paths_until_an_option(tmp_path):
+    odd = tmp_path / "a=b"
+    assert overrides.split_paths(["shelf/one/", "two", "height=9", "x"]) == (
+        ["shelf/one/", "two"],
+        ["height=9", "x"],
+    )
+    assert overrides.split_paths([str(odd)])[0] == []
+    odd.mkdir()
+    assert overrides.split_paths([str(odd), "-m"]) == ([str(odd)], ["-m"])
+    assert overrides.split_paths(["--help"]) == ([], ["--help"]) and overrides.split_paths([]) == (
+        [],
+        [],
+    )
+
+
 def printed_commands(repository) -> list[tuple[str, str]]:
     """List scripts and overrides in the documents and the comments under conf/."""
     folders = (".", "data", "docs", "examples", "sweeps")

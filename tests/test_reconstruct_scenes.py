@@ -11,23 +11,10 @@ from omegaconf import OmegaConf
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
-from asysplat.overrides import split_paths
 from asysplat.reconstruct.scenes import reconstruct_scenes
 
 TINY = ["height=32", "steps=4", "views=6", "refinement.max_gaussians=500", "video.path=none"]
 TINY += ["paths.weights=none", "cameras=given", "held_out_every=4"]
-
-
-def test_the_first_words_are_paths_until_an_option(tmp_path):
-    odd = tmp_path / "a=b"
-    assert split_paths(["shelf/one/", "two", "height=9", "x"]) == (
-        ["shelf/one/", "two"],
-        ["height=9", "x"],
-    )
-    assert split_paths([str(odd)])[0] == []
-    odd.mkdir()
-    assert split_paths([str(odd), "-m"]) == ([str(odd)], ["-m"])
-    assert split_paths(["--help"]) == ([], ["--help"]) and split_paths([]) == ([], [])
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 Nothing here imports torch, so that mistakes are named and finished scenes are skipped at once.
 """
 
-import json
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from asysplat.errors import InputError
-from asysplat.files import check_exists, make_folder
+from asysplat.files import check_exists, make_folder, read_json
 from asysplat.overrides import path_option
 from asysplat.ranges import Count, check_options
 from asysplat.root import ROOT
@@ -46,7 +45,7 @@ def reconstruct_scenes(paths: Sequence[str], words: Sequence[str], config: DictC
 
     def reconstruct(name: str, path: str) -> str | None:
         """Reconstruct a scene; return its error."""
-        folder, error = root / name, None
+        folder = root / name
         if (run := find_finished(folder)) is not None:
             print(f"{name}: skipped, finished in {run}", flush=True)
             return None
@@ -57,10 +56,11 @@ def reconstruct_scenes(paths: Sequence[str], words: Sequence[str], config: DictC
             command = [sys.executable, str(ROOT / "reconstruct.py"), *options]
             streams = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
             status = subprocess.run(command, env=environment, **streams).returncode
-            if status != 0:
-                output.seek(0)
-                error = (output.read().splitlines() or [f"error: status {status}"])[-1]
-        print(f"{name}: {error or summarize(folder)}", flush=True)
+            output.seek(0)
+            said = output.read().splitlines() or [f"error: status {status}"]
+        run = find_finished(folder)
+        error = said[-1] if status != 0 or run is None else None
+        print(f"{name}: {error or summarize(run)}", flush=True)
         return error
 
     with ThreadPoolExecutor(config.jobs) as pool:
@@ -81,12 +81,9 @@ def find_finished(folder: Path) -> Path | None:
     return next((file.parent for file in sorted(folder.glob("run*/metrics.json"))), None)
 
 
-def summarize(folder: Path) -> str:
-    """Write a finished scene's PSNR, number of Gaussians and seconds."""
-    run = find_finished(folder)
-    if run is None:
-        return "stopped"
-    results = json.loads((run / "metrics.json").read_text())
+def summarize(run: Path) -> str:
+    """Write the PSNR, the number of Gaussians and the seconds of a finished run."""
+    results = read_json(run / "metrics.json")
     kind = "held_out" if "held_out/psnr" in results else "inputs"
     title = "held out" if kind == "held_out" else "of the inputs"
     return (

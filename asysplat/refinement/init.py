@@ -60,7 +60,7 @@ def initial_gaussians(
     elif init == "network":
         if network is None:
             raise InputError("init=network needs a network: give one, or choose plane_sweep.")
-        small = _shrink(views, NETWORK_MAX_SIDE, network.patch)
+        small = shrink_views(views, NETWORK_MAX_SIDE, network.patch)
         gaussians = without_invisible(network.eval()(small))
         pixels = longest / max(small.cameras.height, small.cameras.width)
     elif init in ("plane_sweep", "depth"):
@@ -68,7 +68,7 @@ def initial_gaussians(
             raise InputError("init=depth: there are no depth maps; choose plane_sweep or points.")
         # Depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views.
         stride = -(-longest // PRIOR_MAX_SIDE)
-        small = _shrink(views, longest, stride)
+        small = shrink_views(views, longest, stride)
         size = small.cameras.height // stride, small.cameras.width // stride
         batch = small.map(lambda tensor: tensor[None])
         if init == "depth":
@@ -137,8 +137,8 @@ def depth_views(views: Views) -> list[int]:
 def gaussians_from_prior(views: Views, prior: Prior, spread: float = SPREAD) -> Gaussians:
     """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
 
-    Its standard deviation is `spread` pixels of these.
-    Those of opacities that are too small to be drawn are left out, unless that is all of them.
+    Its standard deviation is `spread` pixels of these. Those of opacities that are too small to be
+    drawn are left out, unless that is all of them.
     """
     size = tuple(prior.distance.shape[-2:])
     cameras = views.cameras.resized(*size)
@@ -192,7 +192,7 @@ def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
 
 
-def _shrink(views: Views, longest: int, multiple: int) -> Views:
+def shrink_views(views: Views, longest: int, multiple: int) -> Views:
     """Return views whose longer side is about `longest` and whose sides are multiples."""
     height, width = views.cameras.height, views.cameras.width
     scale = min(1.0, longest / max(height, width))

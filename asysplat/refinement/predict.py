@@ -15,9 +15,8 @@ STEPS_PAY_FROM = 2.2  # times the seconds of the plane sweep, of two cores
 def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gaussians:
     """Compute the Gaussians of a scene: a plane sweep's, refined for the time that is left.
 
-    Where that is hardly as much as the sweep took, they are one for each of its pixels instead.
-
-    The first call in a process compiles its kernels beside these seconds.
+    Where that is hardly as much as the sweep took, they are one for each of its pixels instead. The
+    first call in a process compiles its kernels beside these seconds.
 
     Args:
         views: the photographs, [V].

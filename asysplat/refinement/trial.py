@@ -1,7 +1,7 @@
 """A trial of settings on small photographs, of which some sit out."""
 
 from asysplat.data.selection import evenly_spaced
-from asysplat.refinement.init import initial_gaussians
+from asysplat.refinement.init import initial_gaussians, shrink_views, sweep
 from asysplat.refinement.refine import refine
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import render
@@ -25,15 +25,14 @@ def trial_gain(
     Args:
         views: the input views, [V], V in TRIAL_VIEWS; they stay as they are.
     """
-    size = views.images.shape[-2:]
-    small = views.resized(*(max(1, round(side * min(1, SIDE / max(size)))) for side in size))
+    small = shrink_views(views, SIDE, multiple=1)
     count = views.num_views // SITTING_OUT
     sitting_out = evenly_spaced(range(views.num_views), count + 2)[1:-1]
     rest = small.select([view for view in range(views.num_views) if view not in sitting_out])
     target, background = small.select(sitting_out), rest.color_behind(rest.mean_color())
-    errors = []
+    estimate, errors = sweep(rest), []
     for tried in (settings, others):
-        start = initial_gaussians("plane_sweep", rest, tried.initial_limit)
+        start = initial_gaussians("plane_sweep", rest, tried.initial_limit, estimate=estimate)
         refined = refine(start, rest, tried, steps=STEPS, background=background, seed=seed)
         image = render(refined, target.cameras, background, masks=target.masks).image
         errors.append((target.masked(image) - target.images).square().mean((-3, -2, -1)))
