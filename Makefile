@@ -8,9 +8,8 @@ PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest 
 install: $(ENV) ## install into .venv
 	@echo "next: source .venv/bin/activate"
 
-# Where depths are known, tasks from parts of the camera paths teach more than those from all of them.
-demo: $(ENV) ## train a small model on synthetic scenes, test it and draw its renderings
-	.venv/bin/python train.py model=asysplat_plane_sweep 'data.window=[40,96]' name=demo
+demo: $(ENV) ## train the paper's network at laptop scale on synthetic scenes, test it and draw its renderings
+	.venv/bin/python train.py name=demo
 	@echo "to run commands of your own: source .venv/bin/activate"
 
 quick: style ## style, and the fast tests

@@ -74,7 +74,6 @@ class PredictionSource:
         sets: names of the test sets that it is measured on.
         facts: what its results depend on, in addition to the target's fingerprint.
         backgrounds: RGB [3] behind its scenes, by scene; the measure's own for the others.
-        early_exit: fractions that the last prediction has skipped, changed by each.
         costs: what the last prediction cost besides seconds and memory, changed by each.
     """
 
@@ -82,7 +81,6 @@ class PredictionSource:
     sets: Sequence[str]
     facts: Mapping[str, float] = field(default_factory=dict)
     backgrounds: Mapping[str, Tensor] = field(default_factory=dict)
-    early_exit: Mapping[str, float] = field(default_factory=dict)
     costs: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -108,8 +106,8 @@ def evaluate(options: DictConfig) -> None:
     # Apart, so that they are measured again once its weights are there
     subfolder = "without_lpips" if measure.lpips is None else ""
     folders = target.folder, target.scene_folder / subfolder
-    extras = source.early_exit, source.costs
-    scenes = measure_scenes(tests, source.predict, measure, fabric.device, *folders, *extras)
+    where = fabric.device, *folders
+    scenes = measure_scenes(tests, source.predict, measure, *where, source.costs)
     if options.write_gaussians is not None:
         folder = Path(options.write_gaussians)
         write_predictions(folder, tests[data.name], source.predict, fabric.device)
@@ -143,8 +141,7 @@ def open_source(
     if net is not None:
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
-        predict = network_prediction(net, fabric)
-        return PredictionSource(predict, list(data.tests), early_exit=net.early_exit_fractions)
+        return PredictionSource(network_prediction(net, fabric), list(data.tests))
     tests = data.tests[data.name]
     if system == "gaussians":
         source = open_gaussians(Path(options.gaussians), tests, fabric.device)
@@ -189,12 +186,11 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 
 
 def load_network(config: DictConfig, device: torch.device) -> Network:
-    """Load a model, with its early exit."""
+    """Load a model."""
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     net = instantiate(config.model)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(device).eval()
-    net.early_exit = instantiate(config.speed)
     print(f"model: {net.describe()}")
     return net
 

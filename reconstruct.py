@@ -47,7 +47,8 @@ from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
 from asysplat.export.viewer import Viewer
-from asysplat.ranges import Count, Fraction, Positive, check_options, check_training
+from asysplat.models.prior.prior import DepthEstimate
+from asysplat.ranges import Count, Fraction, Positive, check_options
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
@@ -61,7 +62,7 @@ from asysplat.refinement import (
     without_unseen,
 )
 from asysplat.refinement.exposure import even_exposures, find_exposures
-from asysplat.refinement.init import INITS, initial_gaussians
+from asysplat.refinement.init import INITS, initial_gaussians, sweep
 from asysplat.refinement.trial import CLEAR_GAIN, TRIAL_FROM, TRIAL_VIEWS, trial_gain
 from asysplat.root import typed
 from asysplat.runs.machine import find_device
@@ -79,7 +80,6 @@ def reconstruct(config: DictConfig) -> None:
     config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
         raise InputError(f"no photographs: {typed('reconstruct')} my_scene, a folder.")
-    check_training(OmegaConf.masked_copy(config, "speed"))
     check_options({name: config[name] for name in RANGES}, RANGES)
     device = find_device(config.device)
     config = for_device(config, device, given_options())
@@ -100,7 +100,9 @@ def reconstruct(config: DictConfig) -> None:
     find_views(config.video, photographs.input_files, photographs.held_out_files)
     print(describe(config, photographs, limit))
     photographs = photographs.to(device)
-    exposures = find_exposures(photographs.inputs) if config.exposure == "auto" else None
+    estimate, exposures = sweep(photographs.inputs), None
+    if config.exposure == "auto":
+        exposures = find_exposures(photographs.inputs, estimate)
     fitted = photographs
     if exposures is not None:
         most = (exposures.mean(-1).max() - exposures.mean(-1).min()).exp().item()
@@ -109,7 +111,7 @@ def reconstruct(config: DictConfig) -> None:
     if "refinement" not in given_options():
         limit = choose_refinement(config, fitted.inputs, limit)
         settings = instantiate(config.refinement)
-    gaussians = initialize(config, fitted, settings)
+    gaussians = initialize(config, fitted, settings, estimate)
     background = photographs.background
     results.save_start(gaussians, photographs, background, exposures)
     viewer = Viewer(photographs.inputs, background=background.tolist()) if config.view else None
@@ -120,7 +122,7 @@ def reconstruct(config: DictConfig) -> None:
             results.save(anchors, display.last)
             results.save_video(anchors)
             return
-        refined = refine(gaussians, fitted.inputs, settings, **options)
+        refined = refine(gaussians, fitted.inputs, settings, estimate=estimate, **options)
         gaussians = without_unseen(refined, fitted.inputs)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
@@ -245,25 +247,24 @@ def choose_refinement(
 
 
 def initialize(
-    config: DictConfig, photographs: Photographs, settings: RefinementSettings | ScaffoldSettings
+    config: DictConfig,
+    photographs: Photographs,
+    settings: RefinementSettings | ScaffoldSettings,
+    estimate: DepthEstimate,
 ) -> Gaussians:
     """Build the Gaussians to refine, in the network's frame, on the photographs' device."""
     init, network, device = config.init, None, photographs.inputs.images.device
     if init == "network":
+        if config.checkpoint is None:
+            raise InputError("init=network: name a trained one, checkpoint=....ckpt.")
         network = load(config.checkpoint).to(device)
-        network.early_exit = instantiate(config.speed)
     if init not in INITS and Path(str(init)).suffix:
         gaussians = read_gaussians(init, photographs.origin).to(device)
         gaussians = photographs.normalization.to_network(gaussians)
     else:
-        gaussians = initial_gaussians(
-            init, photographs.inputs, settings.initial_limit, photographs.points, network
-        )
+        known = photographs.points, network, estimate
+        gaussians = initial_gaussians(init, photographs.inputs, settings.initial_limit, *known)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
-    if network is not None and network.early_exit_fractions:
-        fractions = network.early_exit_fractions.items()
-        skipped = (f"{fraction:.0%} of {name}" for name, fraction in fractions)
-        print(f"early exit left out {', '.join(skipped)}")
     return gaussians
 
 

@@ -65,7 +65,6 @@ def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     stage.begin(trainer, data)
     with stage.resuming(trainer):
         trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
-    net.early_exit = instantiate(config.speed)
     trainer.test(module, data, verbose=False)
     run.record(stage, trainer, callbacks)
 

@@ -1,4 +1,4 @@
-"""Load a trained network by the name of its file: `asysplat.load("shipped")`."""
+"""Load a model: `asysplat.load("shipped")`, or a trained network by the name of its file."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -16,18 +16,17 @@ from asysplat.root import CONF
 from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.run_config import read_config
 
-SHIPPED_MODEL = "model=asysplat_plane_sweep"
+SHIPPED_MODEL = "model=plane_sweep"
 
 
 def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> Network:
-    """Load a network in evaluation mode: `load("shipped")(views)`.
+    """Load a model in evaluation mode: `load("shipped")(views)`.
 
     Args:
-        checkpoint: "shipped" for the model that comes with the project; a .ckpt file in the folder
-            of its run, whose config.yaml describes the model; a .safetensors file with the layout
-            of the shipped model; None: without training.
-        overrides: options of train.py, which change the shipped model and its early exit
-            (`speed=fast`); a run's model ignores them.
+        checkpoint: "shipped" for the plane sweep, which needs no training; a .ckpt file in the
+            folder of its run, whose config.yaml describes the network; a .safetensors file of the
+            network that `overrides` describe; None: that network, untrained.
+        overrides: options of train.py (`model.planes=96`); a run's network ignores them.
 
     Raises:
         InputError: no such file, the weights of another model, or an unknown override.
@@ -49,14 +48,13 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             )
         net = instantiate(read_config(config_path).model)
     else:
-        if not any(override.startswith("model=") for override in overrides):
-            overrides = [SHIPPED_MODEL, *overrides]
+        if checkpoint == "shipped":
+            checkpoint, overrides = None, [SHIPPED_MODEL, *overrides]
         check_overrides(overrides)
         initialized = GlobalHydra.instance().is_initialized()
         with nullcontext() if initialized else initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("train", list(overrides))
         net = instantiate(config.model)
-        net.early_exit = instantiate(config.speed)
     weights = nn.ModuleDict({"net": net})  # named as in a checkpoint
     load_weights(checkpoint, weights, option="checkpoint")
     return net.eval()

@@ -35,8 +35,6 @@ TRAINING = {
         f"training.loss.{term}": NotNegative
         for term in ("mse", "ssim", "perceptual", "depth", "opacity")
     },
-    "speed.skip_layers_above": PositiveFraction | None,
-    "speed.skip_network_above": PositiveFraction | None,
     "callbacks.non_finite_steps.budget": Count,
     "callbacks.monitor.every": Count,
     "callbacks.figures.scenes": Index,

@@ -11,7 +11,6 @@ PACKAGE = Path(__file__).parent
 INSTALLED = PACKAGE / "installed"
 ROOT = INSTALLED if INSTALLED.is_dir() else PACKAGE.parent
 CONF = ROOT / "conf"
-CHECKPOINTS = ROOT / "checkpoints"
 try:
     __version__ = version("asysplat")
 except PackageNotFoundError:  # a copy that is not installed

@@ -19,7 +19,8 @@ from asysplat.errors import InputError
 ORTHONORMAL_TOLERANCE = 1e-3
 TINY = 1e-6  # depths and inverse depths above which nothing underflows
 MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
-MAPS = ("depths", "masks", "alphas", "point_depths", "disparities")  # optional fields of `Views`
+MAPS = ("depths", "masks", "alphas", "disparities")  # optional fields of `Views`
+UNKNOWN = {"masks": True, "alphas": 1.0}  # where a field is unknown; depths are 0
 
 Record = TypeVar("Record", bound="TensorRecord")
 
@@ -122,6 +123,12 @@ class Cameras(TensorRecord):
             intrinsics=self.intrinsics.index_select(-3, index),
             cam_to_world=self.cam_to_world.index_select(-3, index),
         )
+
+    def join(self, others: "Cameras") -> "Cameras":
+        """Return these cameras and then others of the same size."""
+        intrinsics = torch.cat((self.intrinsics, others.intrinsics), dim=-3)
+        poses = torch.cat((self.cam_to_world, others.cam_to_world), dim=-3)
+        return replace(self, intrinsics=intrinsics, cam_to_world=poses)
 
     def resized(self, height: int, width: int) -> "Cameras":
         """Return cameras of `height` x `width` pixels with the same field of view."""
@@ -236,7 +243,6 @@ class Views(TensorRecord):
         masks: [..., V, H, W], True where a pixel counts.
         alphas: [..., V, H, W] opacity of the photographed object in [0, 1]: 0 where a pixel shows
             the background alone.
-        point_depths: [..., V, H, W] depths of the scene's sparse points; 0 in pixels without one.
         disparities: [..., V, H, W] estimated inverse depths, up to a scale and a shift of each
             view; 0 if unknown.
 
@@ -255,7 +261,6 @@ class Views(TensorRecord):
     depths: Float[Tensor, "*batch V H W"] | None = None
     masks: Bool[Tensor, "*batch V H W"] | None = None
     alphas: Float[Tensor, "*batch V H W"] | None = None
-    point_depths: Float[Tensor, "*batch V H W"] | None = None
     disparities: Float[Tensor, "*batch V H W"] | None = None
 
     def __post_init__(self):
@@ -284,6 +289,33 @@ class Views(TensorRecord):
         images = self.images.index_select(-4, index)
         return replace(self, cameras=self.cameras.select(index), images=images, **selected)
 
+    def join(self, others: "Views") -> "Views":
+        """Return these views and then others of the same size.
+
+        A field that only one part has is unknown of the other: masked in, opaque, depth 0.
+        """
+        sizes = [(part.cameras.height, part.cameras.width) for part in (self, others)]
+        if sizes[0] != sizes[1]:
+            raise InputError(
+                f"Views.join got {sizes[0]} and {sizes[1]} pixels: give both one size."
+            )
+        parts, maps = (self, others), {}
+        for name in MAPS:
+            known = [getattr(part, name) for part in parts]
+            like = next((values for values in known if values is not None), None)
+            if like is not None:
+                maps[name] = torch.cat(
+                    [
+                        like.new_full(part.images[..., 0, :, :].shape, UNKNOWN.get(name, 0))
+                        if values is None
+                        else values
+                        for part, values in zip(parts, known, strict=True)
+                    ],
+                    dim=-3,
+                )
+        images = torch.cat([part.images for part in parts], dim=-4)
+        return Views(self.cameras.join(others.cameras), images, **maps)
+
     @property
     def known_depths(self) -> Float[Tensor, "*batch V H W"] | None:
         """The depths, 0 where they are unknown or a mask excludes the pixel."""
@@ -306,16 +338,12 @@ class Views(TensorRecord):
         """Return views of another size, with the same field of view.
 
         Images and alphas are means over areas. A pixel is masked in only where all pixels it covers
-        are; a depth or disparity is that of the nearest pixel, a point's that of the nearest point.
+        are; a depth or disparity is that of the nearest pixel.
         """
         size = (height, width)
         area, nearest = (
             partial(F.interpolate, size=size, mode=mode) for mode in ("area", "nearest")
         )
-
-        def nearest_point(depths: Tensor) -> Tensor:
-            inverse = F.adaptive_max_pool2d((depths > 0) / depths.clamp_min(TINY), size)
-            return (inverse > 0) / inverse.clamp_min(TINY)
 
         methods: dict[str, Callable[[Tensor], Tensor]] = {
             "images": area,
@@ -323,7 +351,6 @@ class Views(TensorRecord):
             "masks": lambda masks: whole_pixels(masks, size),
             "depths": nearest,
             "disparities": nearest,
-            "point_depths": nearest_point,
         }
         resized = {}
         for name, method in methods.items():
@@ -396,7 +423,7 @@ class Views(TensorRecord):
                 "has values outside [0, 1]: divide 8-bit images by 255",
             )
         distances = "distances along the camera's z axis"
-        units = {"depths": distances, "point_depths": distances, "disparities": "inverse depths"}
+        units = {"depths": distances, "disparities": "inverse depths"}
         for field, unit in units.items():
             values = getattr(self, field)
             if values is not None:

@@ -44,7 +44,7 @@ PRODUCTS = {
     call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.convolution)
 }
 ROWS = 20_000  # rows of parameters, half of which Adam updates
-NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
+NETWORK, VIEWS, VIEW_SIDE = "asysplat_4m4s", 4, 64
 
 
 class Pair(NamedTuple):

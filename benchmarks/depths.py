@@ -10,7 +10,7 @@ from rich.table import Table
 from asysplat.data import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
 from asysplat.evaluation.metrics import abs_rel, delta1
-from asysplat.models import PlaneSweepPrior
+from asysplat.models import PlaneSweep
 from asysplat.refinement.init import MIN_CONFIDENCE
 from asysplat.scene import Views
 from benchmarks.compare import ERROR, TrackedMetrics
@@ -49,7 +49,7 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 def _row(name: str, views: Views) -> Result:
     clock = time.perf_counter()
-    sweep = PlaneSweepPrior().sweep(views.map(lambda tensor: tensor[None]))
+    sweep = PlaneSweep().sweep(views.map(lambda tensor: tensor[None]))
     seconds = time.perf_counter() - clock
     target = views.resized(SIDE, SIDE).known_depths
     assert target is not None

@@ -108,18 +108,16 @@ RenderScene = Callable[[Photographs], RenderedViews]
 
 @dataclass(frozen=True)
 class FeedForward:
-    """A setting that renders a network's prediction, some of its Gaussians merged or dropped."""
+    """A setting that renders a model's prediction, some of its Gaussians merged or dropped."""
 
     views: int  # input views
     side: int  # side of the input views, in pixels
     checkpoint: str | None = "shipped"  # see `load`; None: untrained
-    # Overrides of train.py; with a checkpoint they may change no weights.
-    overrides: Sequence[str] = ()
-    precision: str = "fp32"  # fp32; bf16: autocast of the network; fp64: everything in float64
+    overrides: Sequence[str] = ()  # of train.py, see `load`
+    precision: str = "fp32"  # fp32; bf16: autocast of a network; fp64: everything in float64
     min_opacity: float = 0.0  # Gaussians of a lower opacity are dropped
     cell: float | None = None  # side in pixels of the cells in which Gaussians are merged
     max_gaussians: int | None = None  # cells grow until at most this many are left; None: no limit
-    sh_degree: int | None = None  # highest SH degree rendered; None: all
     views_at_once: int | None = None  # number of views rendered together; None: all
     limits: Mapping[str, float] = field(default_factory=dict)  # cut-offs of the renderer
 
@@ -139,8 +137,8 @@ class FeedForward:
         if (device, dtype) != (CPU, torch.float32):
             net = deepcopy(net).to(device, dtype)
         half = PRECISIONS.get(self.precision) == torch.bfloat16
-        options = {"sh_degree": self.sh_degree, "views_at_once": self.views_at_once}
-        options |= {"depth": False, "limits": replace(INRIA, **self.limits)}
+        options = {"views_at_once": self.views_at_once, "depth": False}
+        options["limits"] = replace(INRIA, **self.limits)
 
         @torch.no_grad()
         def run(scene: Photographs) -> RenderedViews:
@@ -168,7 +166,7 @@ class Refined:
     side: int | None  # side of the input views, in pixels; None if `views` is None
     steps: int | None = None  # limit under which every round is the same; 0: the start alone
     seconds: float | int | None = None  # limit instead of `steps`
-    init: str = "plane_sweep"  # see `initial_gaussians`; "network" is the shipped one
+    init: str = "plane_sweep"  # see `initial_gaussians`
     refinement: Mapping[str, Any] = field(default_factory=dict)  # overrides of conf/refinement
 
     trained = True
@@ -187,13 +185,12 @@ class Refined:
         except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
             message = f"{self.refinement} are no settings of a refinement."
             raise InputError(str(input_error_behind(error) or message)) from None
-        net = _load_network("shipped", ()) if self.init == "network" else None
         limit = {"steps": self.steps, "seconds": self.seconds}
 
         def run(scene: Photographs) -> RenderedViews:
             scene = select_inputs(scene, self.views, self.side)
             gaussians = initial_gaussians(
-                self.init, scene.inputs, settings.initial_limit, scene.points, net
+                self.init, scene.inputs, settings.initial_limit, scene.points
             )
             color = scene.inputs.mean_color()
             if self.steps != 0:
@@ -296,7 +293,7 @@ def _open_real_scene(path: Path, side: int, inputs: int, targets: int) -> Photog
 
 
 def _without_depths(views: Views) -> Views:
-    return replace(views, depths=None, masks=None, point_depths=None)
+    return replace(views, depths=None, masks=None)
 
 
 def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Photographs:

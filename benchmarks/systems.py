@@ -1,4 +1,4 @@
-"""Quality over seconds: one pass of a network, and refinements as ours and others schedule them.
+"""Quality over seconds: refinements as ours and others schedule them.
 
 Every system gets the same photographs and is measured on the same held-out ones. A refinement is
 measured on its way; its clock stands still meanwhile.
@@ -24,7 +24,6 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from asysplat import load
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
@@ -46,21 +45,19 @@ from asysplat.rendering import render
 from asysplat.scene import Cameras, Views
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
 from benchmarks.options import check_names
-from benchmarks.pareto import NOISE_OF_SECONDS, FeedForward, find_scenes
+from benchmarks.pareto import NOISE_OF_SECONDS, find_scenes
 from benchmarks.table import Columns, machine_note, make_table, number_column, text_column
 from benchmarks.timing import Result
 from paper.style import FAINT, OURS, PAPER, STYLE
 
 PUBLISHED_STEPS = 30_000  # of 3DGS and Scaffold-GS
-SPEEDS = ("fast", "balanced", "exact")  # of the network, see conf/speed
-NETWORK = "plane-sweep model, one pass"
 TRACKED = TrackedMetrics(
     names=("scene", "system", "mark"),
     must_match=("photographs", "limit"),
     kinds={"psnr": DECIBELS, "lpips": LPIPS_DISTANCE},
 )
 NOTES = """\
-mark: seconds after which a refinement is measured, or the network's speed=; s: those it took
+mark: seconds after which a refinement is measured; s: those it took
 start: what the Gaussians are placed by: points of the files where a scene has them
 cut: the published 30,000 steps, ended by the time limit; else the schedule takes all the time"""
 
@@ -75,15 +72,13 @@ class RefinedSystem:
 
 
 CURVES = {
-    "plane-sweep model, refined": RefinedSystem("network", DEFAULT),
     "plane sweep, refined": RefinedSystem("plane_sweep", DEFAULT),
     "3DGS": RefinedSystem(None, PUBLISHED_3DGS),
     "3DGS, cut": RefinedSystem(None, PUBLISHED_3DGS, cut=True),
     "Scaffold-GS": RefinedSystem(None, SCAFFOLD_GS),
     "Scaffold-GS, cut": RefinedSystem(None, SCAFFOLD_GS, cut=True),
 }
-COLORS = {NETWORK: OURS, "plane-sweep model, refined": OURS, "plane sweep, refined": "#101112"}
-COLORS |= {"3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}
+COLORS = {"plane sweep, refined": OURS, "3DGS": PAPER, "Scaffold-GS": "#2f8f4e"}
 Draw = Callable[[Cameras], Tensor]  # images of a scene, [V, 3, H, W]
 Measure = Callable[[Draw, bool], Result]  # the bool: whether it is the last time
 
@@ -100,8 +95,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     increasing = all(a < b for a, b in zip([0, *marks], marks, strict=False))
     if not marks or not increasing:
         raise InputError(f"systems.marks={marks}: give increasing seconds above 0.")
-    names = [NETWORK, *CURVES] if config["names"] == "all" else config["names"]
-    check_names("systems.names", names, [NETWORK, *CURVES, "all"])
+    names = list(CURVES) if config["names"] == "all" else config["names"]
+    check_names("systems.names", names, [*CURVES, "all"])
     scenes, absent = find_scenes(config["scenes"], shared / "data", "systems.scenes")
     protocol = instantiate(options.metrics)
     lpips = load_lpips(protocol.lpips_net, shared / "weights")
@@ -114,10 +109,7 @@ def measure(options: DictConfig, console: Console) -> Result:
 
         where = {"scene": scene_name, "photographs": config["photographs"], "limit": marks[-1]}
         for name in track(names, escape(scene_name), console=console, transient=True):
-            if name == NETWORK:
-                found = measure_network(photographs, quality)
-            else:
-                found = measure_refinement(photographs, CURVES[name], marks, quality)
+            found = measure_refinement(photographs, CURVES[name], marks, quality)
             rows += [where | {"system": name} | row for row in found]
         console.print(f"{scene_name}: {len(names)} systems", highlight=False)
     return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}
@@ -134,37 +126,15 @@ def measure_quality(
     return average_metrics(rows, "images")
 
 
-@torch.no_grad()
-def measure_network(photographs: Photographs, quality: Measure) -> list[Result]:
-    """Measure one pass of the shipped network at each speed, after one to warm up."""
-    rows = []
-    side = min(128, photographs.inputs.cameras.height)
-    for speed in SPEEDS:
-        setting = FeedForward(
-            views=photographs.inputs.num_views, side=side, overrides=[f"speed={speed}"]
-        )
-        run = setting.prepare(OmegaConf.create(), photographs.inputs.images.device)
-        run(photographs)
-        clock = time.perf_counter()
-        rendered = run(photographs)
-        seconds = time.perf_counter() - clock
-        row = {"mark": speed, "seconds": seconds, "steps": None, "start": "network"}
-        row |= {"gaussians": rendered.num_gaussians}
-        images = iter(rendered.images[:, None])  # `quality` draws the held-out views in their order
-        rows.append(row | quality(lambda _: next(images), True))  # noqa: B023, called at once
-    return rows
-
-
 def measure_refinement(
     photographs: Photographs, curve: RefinedSystem, marks: Sequence[float], quality: Measure
 ) -> list[Result]:
     """Measure a refinement after each mark, in seconds."""
     settings, inputs = curve.settings, photographs.inputs
     start = curve.start or ("plane_sweep" if photographs.points is None else "points")
-    network = load("shipped") if start == "network" else None
     clock = time.perf_counter()
     gaussians = initial_gaussians(
-        start, photographs.inputs, settings.initial_limit, photographs.points, network
+        start, photographs.inputs, settings.initial_limit, photographs.points
     )
     before = time.perf_counter() - clock
     background, rows, due = photographs.background, [], list(marks)
@@ -236,12 +206,11 @@ def plot(results: Result) -> Figure:
                 points = [(r["seconds"], r[metric]) for r in rows if r["system"] == system]
                 style = "--" if system.endswith(", cut") else "-"
                 color = COLORS[system.removesuffix(", cut")]
-                marker = "s" if system == NETWORK else "o"
                 axes.plot(
                     *zip(*points, strict=True),
                     style,
                     color=color,
-                    marker=marker,
+                    marker="o",
                     ms=4,
                     label=system,
                 )

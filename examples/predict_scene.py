@@ -1,6 +1,6 @@
-"""Predict Gaussians with a network and render target views, without Lightning.
+"""Predict Gaussians with a model and render target views, without Lightning.
 
-python examples/predict_scene.py [logs/demo/.../checkpoints/best.ckpt] [figure.png]
+python examples/predict_scene.py [logs/demo/.../checkpoints/last.ckpt] [figure.png]
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Read the paper's tables, every number of which is in paper.yaml, and ours, in ours.yaml."""
+"""Read the paper's tables, every number of which is in paper.yaml."""
 
 import difflib
 from collections.abc import Collection, Sequence
@@ -141,15 +141,15 @@ class PaperTable:
 
 
 @cache
-def load_paper(file: str = "paper") -> dict[str, PaperTable]:
-    """Read every table of the paper, or of the file "ours"; by key, in its order."""
-    return {key: _table(key, entry) for key, entry in _read(file)["tables"].items()}
+def load_paper() -> dict[str, PaperTable]:
+    """Read every table of the paper; by key, in its order."""
+    return {key: _table(key, entry) for key, entry in _read()["tables"].items()}
 
 
 @cache
 def load_claims() -> PaperTable:
     """Read what the paper's text says of its tables."""
-    entry, tables = _read("paper")["claims"], load_paper()
+    entry, tables = _read()["claims"], load_paper()
     claims = []
     for claim in entry["claims"]:
         rows = {row.name: row for row in tables[claim["table"]].rows}
@@ -162,8 +162,8 @@ def load_claims() -> PaperTable:
 
 
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
-    """Find tables of the paper, "claims" or ours by name: one, several with commas, or "all"."""
-    tables = load_paper() | {"claims": load_claims()} | load_paper("ours")
+    """Find tables of the paper, or "claims", by name: one, several with commas, or "all"."""
+    tables = load_paper() | {"claims": load_claims()}
     names = names.split(",") if isinstance(names, str) else list(names)
     if names == ["all"]:
         return list(tables.values())
@@ -187,7 +187,7 @@ def our_sets(table: PaperTable, data: str, test_sets: Collection[str]) -> dict[s
         data: the data set of the runs, which is tested as well.
         test_sets: the further ones that their configuration names.
     """
-    substitutes = _read("paper")["substitutes"].get(data, {})
+    substitutes = _read()["substitutes"].get(data, {})
     sets = {key: substitutes.get(key, key) for key in table.test_sets}
     for first in table.test_sets[:1]:
         if first not in test_sets and first not in substitutes:
@@ -197,12 +197,12 @@ def our_sets(table: PaperTable, data: str, test_sets: Collection[str]) -> dict[s
 
 def set_titles() -> dict[str, str]:
     """Return the paper's test sets, as it prints them, by key."""
-    return _read("paper")["test_sets"]
+    return _read()["test_sets"]
 
 
 @cache
-def _read(name: str) -> dict:
-    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name(f"{name}.yaml")))
+def _read() -> dict:
+    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("paper.yaml")))
 
 
 def stage_hours(steps: Number, seconds_per_step: Number) -> float:
@@ -211,7 +211,7 @@ def stage_hours(steps: Number, seconds_per_step: Number) -> float:
 
 
 def _column(key: str) -> Column:
-    kind = _read("paper")["columns"][key.rpartition("/")[-1]]
+    kind = _read()["columns"][key.rpartition("/")[-1]]
     unit = float(kind.get("unit", 1))
     return Column(key, kind["title"], kind.get("better"), kind["format"], unit)
 

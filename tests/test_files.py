@@ -105,7 +105,7 @@ def test_a_check_leaves_the_disk_as_it_is(tmp_path):
 UNWRITABLE = {
     "train": ["paths.logs=README.md/x"],
     "reconstruct": ["tests", "paths.logs=README.md/x"],
-    "evaluate": ["init_path=shipped", "model=asysplat_plane_sweep", "paths.logs=README.md/x"],
+    "evaluate": ["model=plane_sweep", "paths.logs=README.md/x"],
     "benchmark": ["suite=bench", "output=README.md/x"],
 }
 

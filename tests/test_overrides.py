@@ -61,7 +61,7 @@ def test_options_of_the_other_scripts():
         ("benchmark", "suite=ops ops.ssd.length=512 model.names=[longlrm]", "repeat=3", "repeats"),
         (
             "evaluate",
-            "init_path=shipped data=files data.root=x scale=gpu",
+            "model=plane_sweep data=files data.root=x scale=gpu",
             "gausians=a.ply",
             "gaussians",
         ),
@@ -139,12 +139,6 @@ def test_every_printed_command_names_what_is_there(repository, request):
                 break
     for (script, *_), options in together.items():
         check_overrides(options.values(), script)
-
-
-def test_printed_commands_with_the_shipped_weights_have_their_model(repository):
-    commands = [given for _, given in printed_commands(repository) if "init_path=shipped" in given]
-    assert commands
-    assert [given for given in commands if "model=asysplat_plane_sweep" not in given] == []
 
 
 @pytest.mark.medium

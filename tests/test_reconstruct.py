@@ -19,12 +19,13 @@ import torch
 import yaml
 from full_disk import largest_file
 from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from pretend_device import DEVICE, pretended_device
 from safetensors import safe_open
 from scipy.spatial.transform import Rotation
 
-from asysplat import read_gaussians, render
+from asysplat import load, read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
@@ -55,6 +56,19 @@ def photographs(views, tmp_path_factory):
     folder = tmp_path_factory.mktemp("photographs") / "scene"
     write_transforms(views, folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def network(composed, tmp_path_factory):
+    """The option that names the checkpoint of a small network."""
+    folder = tmp_path_factory.mktemp("trained")
+    config = composed("width=0.125", "state_size=8", "model.layers=1m1s")
+    model = OmegaConf.to_container(config.model, resolve=True)
+    OmegaConf.save({"model": model}, folder / "config.yaml")
+    weights = {f"net.{name}": x for name, x in instantiate(config.model).state_dict().items()}
+    (folder / "checkpoints").mkdir()
+    torch.save({"state_dict": weights}, folder / "checkpoints" / "last.ckpt")
+    return f"checkpoint={folder}/checkpoints/last.ckpt"
 
 
 @pytest.fixture
@@ -97,16 +111,20 @@ def rows_of(folder):
 
 @pytest.mark.medium
 @pytest.mark.parametrize("init", ["plane_sweep", "network"])
-def test_all_runs_on_the_device_of_the_option(command, photographs, tmp_path, monkeypatch, init):
+def test_all_runs_on_the_device_of_the_option(
+    command, photographs, network, tmp_path, monkeypatch, init
+):
     def find(name):
         assert name == "auto"
         return DEVICE
 
     options = ("steps=3", "refinement.max_gaussians=1000", "views=10", "height=24")
-    options += ("video.path=orbit", f"init={init}")
+    options += ("video.path=orbit", f"init={init}", network)
     finished(command(photographs, *options))
     expected = numbers_of(tmp_path / "run")
     monkeypatch.setattr("asysplat.runs.machine.find_device", find)
+    net = load(network.partition("=")[2])  # torch reads no checkpoint where it pretends
+    monkeypatch.setattr("asysplat.load", lambda _: net)
     with pretended_device(monkeypatch):
         finished(command(photographs, *options))
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
@@ -262,7 +280,7 @@ def test_the_same_steps_and_seed_give_the_same_bytes(command, photographs, tmp_p
 @pytest.mark.medium
 @pytest.mark.parametrize("init", ["network", "depth", "points", "file"])
 def test_each_init_beats_its_baseline(
-    command, first, views, photographs, tmp_path, monkeypatch, init
+    command, first, views, photographs, network, tmp_path, monkeypatch, init
 ):
     if init == "points":
         monkeypatch.syspath_prepend(LAYOUTS)
@@ -270,9 +288,11 @@ def test_each_init_beats_its_baseline(
     elif init == "file":
         init = shutil.copy(first[0] / "scene.ply", tmp_path / "a first scene.ply")
         before = numbers_of(first[0])
-    assert f"init={init}" in finished(command(photographs, f"init='{init}'", "steps=40"))
+    assert f"init={init}" in finished(command(photographs, f"init='{init}'", "steps=40", network))
     after = numbers_of(tmp_path / "run")
-    if init == "points":  # a few, at the rims of the photographs, without depths
+    if init == "network":  # untrained
+        assert after["held_out/psnr"] > after["baseline/mean_color/psnr"] + 5
+    elif init == "points":  # a few, at the rims of the photographs, without depths
         measured = {key for key in after if not key.startswith("protocol")}
         assert not [key for key in measured if "absrel" in key or "depth" in key]
         assert after["inputs/psnr"] > after["baseline/mean_color/psnr"]

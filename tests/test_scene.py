@@ -4,7 +4,7 @@ import re
 import subprocess
 import sys
 import textwrap
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 import torch
@@ -47,18 +47,27 @@ def test_select_and_stack_and_to():
         cameras(3),
         torch.rand(3, 3, 4, 6),
         torch.rand(3, 4, 6),
-        point_depths=torch.rand(3, 4, 6),
         disparities=torch.rand(3, 4, 6),
     )
     picked = views.select([2, 0])
-    assert torch.equal(picked.point_depths, views.point_depths[[2, 0]])
     assert torch.equal(picked.disparities, views.disparities[[2, 0]])
     assert torch.equal(picked.images[0], views.images[2])
     assert torch.equal(picked.depths[1], views.depths[0])
     batch = Views.stack([views, picked.select([0, 1, 1])])
     assert batch.images.shape == (2, 3, 3, 4, 6)
-    assert torch.equal(batch.point_depths[0], views.point_depths)
     assert batch.to(torch.float64).cameras.intrinsics.dtype == torch.float64
+
+
+def test_joined_views_have_every_field_of_both():
+    plain = Views(cameras(2), torch.rand(2, 3, 4, 6))
+    masks, depths = torch.rand(3, 4, 6) < 0.5, torch.rand(3, 4, 6)
+    others = Views(cameras(3), torch.rand(3, 3, 4, 6), depths, masks)
+    both = plain.join(others)
+    assert both.validate().num_views == 5 and both.alphas is None
+    assert both.masks[:2].all() and torch.equal(both.masks[2:], masks)
+    assert not both.depths[:2].any() and torch.equal(both.depths[2:], depths)
+    assert torch.equal(both.select([4]).images, others.images[2:])
+    assert both.resized(2, 3).join(both.resized(2, 3)).num_views == 10
 
 
 def test_views_of_another_size_keep_every_field():
@@ -74,8 +83,6 @@ def test_views_of_another_size_keep_every_field():
     assert torch.equal(half.masks, blocks(views.masks).all(-1).all(-2))
     assert all(getattr(half, name) is not None for name in maps)
     assert half.depths.unique().numel() == 2 * 3 * 2 * 3
-    torch.testing.assert_close(half.point_depths, blocks(views.point_depths).amin((-3, -1)))
-    assert not replace(views, point_depths=torch.zeros(2, 3, 4, 6)).resized(2, 3).point_depths.any()
     for batch in range(2):
         alone = views.map(lambda values: values[batch]).resized(2, 3)  # noqa: B023
         assert torch.equal(alone.images, half.images[batch])

@@ -1,10 +1,9 @@
 """Batches of tasks: the same for the same seed, wherever a run is resumed."""
 
 import re
-import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import current_process, get_all_start_methods
 from typing import NotRequired, TypedDict
@@ -19,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from asysplat.data import loader
 from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
-from asysplat.data.normalize import Normalization, depths_of_points, normalize
+from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.selection import Selection
 from asysplat.data.sequence import FileSequence
 from asysplat.data.sources import Source, Task
@@ -69,7 +68,6 @@ class SceneDataModule(lightning.LightningDataModule):
         test_sets: further test sets by name, each a function that returns its tasks; one with the
             data set's name replaces the source's test.
         augmentation: random changes of training tasks; None changes nothing.
-        points: whether the inputs have the depths of the scene's sparse points.
         on_error: where a training scene cannot be used, "fail", or "skip" to draw another; a
             batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its scenes.
@@ -94,7 +92,6 @@ class SceneDataModule(lightning.LightningDataModule):
     steps_per_epoch: int
     test_sets: Mapping[str, Callable[[], list[Task]]] = field(default_factory=dict)
     augmentation: Augmentation | None = None
-    points: bool = False
     on_error: Policy = "fail"
     micro_batch: int | None = None
     growth_steps: int = 0
@@ -123,29 +120,15 @@ class SceneDataModule(lightning.LightningDataModule):
                 with self._naming(name):
                     tests[name] = make_tasks()
             validation = self.source.evaluation("val", *counts)
-            samples = {"training": TrainingTasks(self)[0]}
+            TrainingTasks(self)[0]  # raises where it cannot be read
             room = MAX_LOADED_BYTES
-            options = {"points": self.points, "process": self._process}
-            self.evaluation["val"] = FixedTasks(validation, "validation", room, **options)
+            self.evaluation["val"] = FixedTasks(validation, "validation", room, self._process)
             room -= self.evaluation["val"].num_bytes
             for name, tasks in tests.items():
                 with self._naming(name):
-                    self.tests[name] = FixedTasks(tasks, f"test {name}", room, **options)
+                    self.tests[name] = FixedTasks(tasks, f"test {name}", room, self._process)
                 room -= self.tests[name].num_bytes
             self.evaluation["test"] = self.tests[self.name]
-            samples |= {name: tasks[0] for name, tasks in self.tests.items()}
-            missing = [
-                f"{sample['scene']} ({name})"
-                for name, sample in samples.items()
-                if sample["inputs"].point_depths is None
-            ]
-            if self.points and missing:
-                warnings.warn(
-                    "data.points=true, but there are no sparse points of "
-                    f"{', '.join(missing)}: their priors work without points. data/README.md lists "
-                    "the files that hold them.",
-                    stacklevel=2,
-                )
 
     @contextmanager
     def _naming(self, test_set: str, main: str | None = None) -> Generator[None]:
@@ -232,7 +215,7 @@ class TrainingTasks(Dataset):
     def __init__(self, data: SceneDataModule):
         self.source, self.seed = data.source, data.seed
         self.augmentation = data.augmentation or Augmentation()
-        self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
+        self.inputs, self.targets = data.inputs, data.targets
         self.draws = MAX_DRAWS if data.on_error == "skip" else 1
         self.growing_tasks = data.growth_steps * data.batch_size
 
@@ -255,7 +238,7 @@ class TrainingTasks(Dataset):
         inputs = self.augmentation.order(task.selection.inputs, rng)
         crop = self.augmentation.draw_crop(rng)
         task = Task(task.sequence, Selection(inputs, task.selection.targets))
-        sample = load(task, crop, self.points)
+        sample = load(task, crop)
         inputs, targets = self.augmentation.expose(sample["inputs"], sample["targets"], rng)
         return {"scene": sample["scene"], "inputs": inputs, "targets": targets}
 
@@ -272,10 +255,9 @@ class FixedTasks(Dataset):
         tasks: Sequence[Task],
         name: str = "",
         room: int | float = MAX_LOADED_BYTES,
-        points: bool = False,
         process: tuple[int, int] = (0, 1),
     ):
-        self.tasks, self.points, self.num_bytes = tasks, points, 0
+        self.tasks, self.num_bytes = tasks, 0
         self._loaded: dict[int, Sample] = {}
         (rank, processes), title = process, escape(f"loading {name}")
         # Processes side by side would draw over each other.
@@ -284,23 +266,22 @@ class FixedTasks(Dataset):
         for index in track(mine, title, transient=True, disable=not alone):
             if self.num_bytes > room:
                 break
-            self._loaded[index] = sample = load(tasks[index], points=points)
+            self._loaded[index] = sample = load(tasks[index])
             self.num_bytes += sum(sample[each].images.nbytes for each in ("inputs", "targets"))
 
     def __len__(self) -> int:
         return len(self.tasks)
 
     def __getitem__(self, index: int) -> Sample:
-        sample = self._loaded.get(index) or load(self.tasks[index], points=self.points)
+        sample = self._loaded.get(index) or load(self.tasks[index])
         inputs, targets = sample["inputs"].decoded(), sample["targets"].decoded()
         return {**sample, "inputs": inputs, "targets": targets}
 
 
-def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
+def load(task: Task, crop: float = 1.0) -> Sample:
     """Read a task's views, with images as stored, validate, crop and normalize them.
 
-    With `points`, the inputs have the depths of the sequence's sparse points, if it has any. The
-    sample's `frame` is the Normalization.
+    The sample's `frame` is the Normalization.
     """
     inputs, targets = task.selection.inputs, task.selection.targets
     # An image that is both input and target is decoded once.
@@ -311,9 +292,6 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
     inputs, targets = (
         views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )
-    sparse = sequence.points if points else None
-    if sparse is not None:
-        inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
     return {
         "scene": sequence.name,

@@ -55,12 +55,8 @@ class Photographs:
     @property
     def cameras(self) -> Cameras:
         """The cameras of the inputs and then of the held-out views."""
-        parts = [views.cameras for views in (self.inputs, self.held_out) if views is not None]
-        return replace(
-            parts[0],
-            intrinsics=torch.cat([cameras.intrinsics for cameras in parts]),
-            cam_to_world=torch.cat([cameras.cam_to_world for cameras in parts]),
-        )
+        inputs, held_out = self.inputs.cameras, self.held_out
+        return inputs if held_out is None else inputs.join(held_out.cameras)
 
     def to(self, device: torch.device) -> "Photographs":
         """Return the photographs with views and points on a device."""
@@ -73,14 +69,8 @@ class Photographs:
         )
 
     def all_views(self) -> Views:
-        """Return the inputs and the held-out views as one, without depths."""
-        parts = [views for views in (self.inputs, self.held_out) if views is not None]
-        images = torch.cat([views.images for views in parts])
-        maps = {}
-        for name in ("masks", "alphas"):
-            values = [getattr(views, name) for views in parts if getattr(views, name) is not None]
-            maps[name] = torch.cat(values) if len(values) == len(parts) else None
-        return Views(self.cameras, images, **maps)
+        """Return the inputs and the held-out views as one."""
+        return self.inputs if self.held_out is None else self.inputs.join(self.held_out)
 
 
 def open_photographs(

@@ -39,7 +39,6 @@ class SceneResult:
     # A row for each image: `images` (targets or inputs), `view`, `method` (post<steps> or a
     # baseline) and its metrics.
     rows: list[ImageRow] = field(default_factory=list)
-    early_exit: dict[str, float] = field(default_factory=dict)  # see `TokenNetwork`
 
     def add(self, images: str, method: str, rows: Sequence[dict[str, float]]) -> None:
         """Add a row of metrics for each view."""

@@ -30,7 +30,6 @@ def measure_scenes(
     device: torch.device,
     folder: Path,
     scene_folder: Path,
-    early_exit: Mapping[str, float],
     costs: Mapping[str, float],
 ) -> dict[str, list[SceneResult]]:
     """Measure every scene that has no result in `scene_folder` yet, with a progress bar.
@@ -40,7 +39,6 @@ def measure_scenes(
         predictor: returns the `predict` of a scene, whose costs are measured.
         folder: for figures/evaluation-post<steps>.png, which show the first scene at the first and
             the last of the steps.
-        early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
         costs: what the last prediction cost besides seconds and memory.
     """
     make_folder(scene_folder, "paths.logs")
@@ -65,7 +63,6 @@ def measure_scenes(
                         comparison_figure(inputs, targets, rendering).savefig(partial, dpi=100)
 
             result = measure(sample["scene"], predictor(sample), inputs, targets, show)
-            result.early_exit.update(early_exit)
             result.costs.get("post0", {}).update(costs)
             psnrs = [
                 f"{_means(result.rows, 'targets', method, 'images')['psnr']:.2f} dB"
@@ -123,8 +120,8 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
 
     As test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
     baseline/<set>/<baseline>/<metric>, cost/gaussians, cost/post<steps>/seconds, see
-    `mean_but_longest`, /gb, the largest, and /steps of refinements, the mean, of further sets under
-    cost/<set>/, and early_exit/<set>/<what>.
+    `mean_but_longest`, /gb, the largest, and /steps of refinements, the mean, and of further sets
+    under cost/<set>/.
     """
     averages: dict[str, float] = {}
     main = next(iter(scenes))
@@ -132,8 +129,6 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
         rows = image_rows({test_set: results})
         prefix = "cost" if test_set == main else f"cost/{test_set}"
         averages[f"{prefix}/gaussians"] = sum(r.gaussians for r in results) / len(results)
-        for name, fraction in average([dict(r.early_exit) for r in results], "images").items():
-            averages[f"early_exit/{test_set}/{name}"] = fraction
         for method in dict.fromkeys(row["method"] for row in rows):
             tested = "test" if method in results[0].costs else "baseline"
             for kind, images in ((tested, "targets"), ("inputs", "inputs")):

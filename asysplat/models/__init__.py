@@ -14,8 +14,8 @@ from asysplat.models.links import (
 )
 from asysplat.models.mamba import BiMamba2, MambaVision
 from asysplat.models.mvsplat import MVSplat
-from asysplat.models.network import EarlyExit, Prune
-from asysplat.models.prior import DepthPrior, PlaneSweepPrior, PointsPrior
+from asysplat.models.network import Prune
+from asysplat.models.prior import PlaneSweep
 from asysplat.models.single_branch import SingleBranch, build_single_branch
 
 __all__ = [
@@ -23,8 +23,6 @@ __all__ = [
     "BiMamba2",
     "CoarseToFine",
     "CoarseTokens",
-    "DepthPrior",
-    "EarlyExit",
     "FineToCoarse",
     "FineTokens",
     "FullAttention",
@@ -34,8 +32,7 @@ __all__ = [
     "MVSplat",
     "MambaVision",
     "NoLink",
-    "PlaneSweepPrior",
-    "PointsPrior",
+    "PlaneSweep",
     "Prune",
     "ResidualHead",
     "SingleBranch",

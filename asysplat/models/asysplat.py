@@ -1,6 +1,6 @@
 """AsySplat: posed images to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -41,7 +41,7 @@ class AsySplat(TokenNetwork):
         fine_to_coarse, coarse_to_fine: components of the bilateral link.
         fusion: component that makes the tokens that Gaussians are predicted from.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
-        widths, prior: see TokenNetwork.
+        widths: see TokenNetwork.
     """
 
     def __init__(
@@ -58,9 +58,8 @@ class AsySplat(TokenNetwork):
         head: Callable[..., GaussianHead],
         patch_coarse: int = 16,
         patch_fine: int = 8,
-        prior: nn.Module | None = None,
     ):
-        super().__init__(widths, patch_coarse, prior)
+        super().__init__(widths, patch_coarse)
         if patch_coarse % patch_fine:
             raise InputError(
                 f"model.patch_coarse={patch_coarse} is not a multiple of "
@@ -70,7 +69,7 @@ class AsySplat(TokenNetwork):
         shapes = widths.stage_shapes(stage_ratios)
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = Branch(
-            build_component(Tokenizer, patch_coarse, widths.stages[0], self.pixel_channels),
+            build_component(Tokenizer, patch_coarse, widths.stages[0]),
             stages=(
                 build_component(Stage, previous.width, shape, layers, blocks)
                 for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
@@ -78,7 +77,7 @@ class AsySplat(TokenNetwork):
             links=(build_component(fine_to_coarse, shape, fine) for shape in shapes),
         )
         self.appearance = Branch(
-            build_component(Tokenizer, patch_fine, widths.fine, self.pixel_channels),
+            build_component(Tokenizer, patch_fine, widths.fine),
             stages=(
                 Layers(build_component(appearance_block, fine) for _ in range(appearance_layers))
                 for _ in shapes
@@ -90,9 +89,7 @@ class AsySplat(TokenNetwork):
         )
         self.head = build_component(head, widths.stages[-1], patch_coarse, patch_fine)
 
-    def tokens(
-        self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
-    ) -> Float[Tensor, "B V h w d"]:
+    def tokens(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
         coarse = self.geometry.tokenizer(pixels)  # [B, V, H / p_c, W / p_c, d_1]
         fine = self.appearance.tokenizer(pixels)  # [B, V, H / p_f, W / p_f, d_v]
         branches = zip(
@@ -103,21 +100,11 @@ class AsySplat(TokenNetwork):
             strict=True,
         )
         for geometry, appearance, fine_to_coarse, coarse_to_fine in branches:
-            coarse, _ = geometry(coarse, skip_layers)  # [B, V, H / p_c, W / p_c, d_s]
-            fine = appearance(fine, skip_layers)
+            coarse, _ = geometry(coarse)  # [B, V, H / p_c, W / p_c, d_s]
+            fine = appearance(fine)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = fine_to_coarse(coarse, fine), coarse_to_fine(fine, coarse)
         return self.fusion(coarse, fine)  # [B, V, H / p_f, W / p_f, d], or of p_c
-
-    @property
-    def skippable_layers(self) -> Collection[nn.Module]:
-        """All layers of both branches after the first stage.
-
-        Without them the shipped model loses at most 0.06 dB (docs/results/pareto.md).
-        """
-        stages = nn.ModuleList([*self.geometry.stages[1:], *self.appearance.stages[1:]])
-        groups = [module for module in stages.modules() if isinstance(module, Layers)]
-        return {layer for layers in groups for layer in layers}
 
     def geometry_ratio(self) -> float:
         """Return the fraction of parameters outside the appearance branch (paper: about 0.9)."""

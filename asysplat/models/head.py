@@ -3,7 +3,6 @@
 The paper gives the 59 numbers of a Gaussian, not their meaning; each head has its own.
 """
 
-import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -15,15 +14,7 @@ from torch import Tensor, nn
 
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.kernels.dispatch import without_autocast
-from asysplat.models.prior import Prior
 from asysplat.scene import Gaussians, Views
-
-# With a prior the network's corrections are bounded: on scenes unlike those of its training it is
-# wrong more often than the prior. Depth corrections are in logits of `depth_fraction`.
-MAX_DEPTH_CORRECTION = 0.01  # greatest depth correction at confidence 0; more makes surfaces rough
-CONFIDENT_FACTOR = 0.3  # factor of MAX_DEPTH_CORRECTION at confidence 1
-MAX_DEPTH_WITHOUT_PRIOR = 10.0  # greatest depth correction in scenes without any known depth
-MAX_SIZE_CORRECTION = 1.0  # greatest correction of a size, in logarithms
 
 
 class Decoded(NamedTuple):
@@ -43,8 +34,8 @@ class GaussianHead(nn.Module, ABC):
 
     Args:
         width, patch_coarse, patch_fine: d_3, p_c, p_f.
-        sh_degree: 0 to 3; None for a head that predicts no colors.
-        opacity_bias: logit of an untrained opacity without a prior.
+        sh_degree: 0 to 3.
+        opacity_bias: logit of an untrained opacity.
         std: standard deviation of the untrained weights.
     """
 
@@ -53,7 +44,7 @@ class GaussianHead(nn.Module, ABC):
         width: int,
         patch_coarse: int,
         patch_fine: int,
-        sh_degree: int | None,
+        sh_degree: int,
         opacity_bias: float,
         std: float,
     ):
@@ -61,55 +52,29 @@ class GaussianHead(nn.Module, ABC):
         self.opacity_bias = opacity_bias
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
         # position, quaternion, scale, opacity, SH
-        self.sh_bands = 0 if sh_degree is None else (sh_degree + 1) ** 2
+        self.sh_bands = (sh_degree + 1) ** 2
         self.splits = (3, 4, 3, 1, 3 * self.sh_bands)
         self.norm = nn.LayerNorm(width, bias=False)
         self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
         nn.init.normal_(self.decode.weight, std=std)
 
-    def forward(
-        self, features: Float[Tensor, "B V h w d"] | None, views: Views, prior: Prior | None = None
-    ) -> Gaussians:
-        """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
-
-        With a prior, the opacities are the prior's, and the decoder corrects its distances, less
-        at higher confidence. Without features nothing is corrected.
-        """
-        if features is None:
-            size = (views.cameras.height // self.stride, views.cameras.width // self.stride)
-            zeros = views.images.new_zeros(())
-            raw = zeros.expand(*views.images.shape[:2], *size, sum(self.splits))
-        else:
-            pattern, side = "b v h w (p q z) -> b v (h p) (w q) z", self.patch
-            raw = rearrange(self.decode(self.norm(features)), pattern, p=side, q=side)
+    def forward(self, features: Float[Tensor, "B V h w d"], views: Views) -> Gaussians:
+        """Decode Gaussians [B, V h p_f w p_f], row by row of view after view."""
+        pattern, side = "b v h w (p q z) -> b v (h p) (w q) z", self.patch
+        raw = rearrange(self.decode(self.norm(features)), pattern, p=side, q=side)
         with without_autocast(raw):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
             # The mean of three outputs, as in Long-LRM.
-            depth_logit = position.mean(-1, keepdim=True)
-            if prior is None:
-                opacities = (opacities[..., 0] + self.opacity_bias).sigmoid()
-            else:
-                expected = self.depth_fraction(prior.distance, views).clamp(1e-4, 0.99).logit()
-                bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
-                has_depth = (prior.confidence > 0).flatten(1).any(-1)[:, None, None, None]
-                bound = torch.where(has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
-                depth_logit = (expected + squash(depth_logit[..., 0], bound))[..., None]
-                opacities = prior.opacity
-                scales = squash(scales, MAX_SIZE_CORRECTION)
+            depth_fraction = position.mean(-1, keepdim=True).sigmoid()
+            opacities = (opacities[..., 0] + self.opacity_bias).sigmoid()
             sh = sh.unflatten(-1, (self.sh_bands, 3))
-            decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities, sh)
+            decoded = Decoded(depth_fraction, quats, scales, opacities, sh)
             return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
 
     def unit(self, views: Views) -> Float[Tensor, "B 1 1 1 1"] | float:
         """Return the unit of length of the ray moments that the network reads."""
         return 1.0
-
-    @abstractmethod
-    def depth_fraction(
-        self, distance: Float[Tensor, "B V h w"], views: Views
-    ) -> Float[Tensor, "B V h w"]:
-        """Return the place of a distance in the head's range, in [0, 1] if it is inside."""
 
     @abstractmethod
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
@@ -124,7 +89,7 @@ class ResidualHead(GaussianHead):
     the appearance branch contributes less than in a head without it.
 
     Args:
-        sh_degree: 0 to 3; None: the colors are those of the image.
+        sh_degree: 0 to 3.
         near, far: distances along the ray lie between them, in units of the normalized scene.
         scale_bias: log of an untrained size, in pixel footprints.
     """
@@ -134,7 +99,7 @@ class ResidualHead(GaussianHead):
         width: int,
         patch_coarse: int,
         patch_fine: int,
-        sh_degree: int | None = 3,
+        sh_degree: int = 3,
         near: float = 0.1,
         far: float = 100.0,
         opacity_bias: float = 0.0,
@@ -142,11 +107,6 @@ class ResidualHead(GaussianHead):
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=1e-3)
         self.near, self.far, self.scale_bias = near, far, scale_bias
-
-    def depth_fraction(
-        self, distance: Float[Tensor, "B V h w"], views: Views
-    ) -> Float[Tensor, "B V h w"]:
-        return (distance / self.near).log() / math.log(self.far / self.near)
 
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
         cameras = views.cameras.resized(*raw.opacities.shape[2:])
@@ -158,7 +118,7 @@ class ResidualHead(GaussianHead):
         batch = views.images.shape[:2]
         small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(0, batch)
         dc = (rearrange(small, "b v c h w -> b v h w 1 c") - 0.5) / SH_C0
-        sh = torch.cat((raw.sh[..., :1, :] + dc, raw.sh[..., 1:, :]), -2) if self.sh_bands else dc
+        sh = torch.cat((raw.sh[..., :1, :] + dc, raw.sh[..., 1:, :]), -2)
         return Gaussians(
             means=origins + distance * directions,
             quats=raw.quats + identity,
@@ -204,11 +164,6 @@ class LongLRMHead(GaussianHead):
         largest = views.cameras.centers.abs().amax((-2, -1))
         return largest.clamp_min(3**-0.5)[:, None, None, None, None]
 
-    def depth_fraction(
-        self, distance: Float[Tensor, "B V h w"], views: Views
-    ) -> Float[Tensor, "B V h w"]:
-        return distance / (self.farthest * self.unit(views)[..., 0])
-
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
         origins, directions = views.cameras.resized(*raw.opacities.shape[2:]).rays()
         unit = self.unit(views)
@@ -221,8 +176,3 @@ class LongLRMHead(GaussianHead):
             opacities=raw.opacities,
             sh=raw.sh,
         )
-
-
-def squash(values: Tensor, bound: Tensor | float) -> Tensor:
-    """Squash numbers into [-bound, bound]; small ones hardly change."""
-    return bound * (values / bound).tanh()

@@ -1,6 +1,6 @@
 """What blocks are made of: shapes, norms, tokenizers and layers."""
 
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
@@ -13,7 +13,6 @@ from torch.utils.checkpoint import checkpoint
 
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import without_autocast
-from asysplat.models.prior import Prior
 from asysplat.scene import Views
 
 
@@ -74,27 +73,24 @@ PIXEL_CHANNELS = 9
 
 
 def pixel_features(
-    views: Views, prior: Prior | None, unit: Float[Tensor, "B 1 1 1 1"] | float
-) -> Float[Tensor, "B V H W c"]:
-    """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel.
+    views: Views, unit: Float[Tensor, "B 1 1 1 1"] | float
+) -> Float[Tensor, "B V H W 9"]:
+    """Return RGB in [-1, 1], ray moment o x d and unit direction d of every pixel.
 
     The moment is in units of length `unit`.
     """
     origins, directions = views.cameras.rays()
     colors = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
-    features = [colors, torch.linalg.cross(origins / unit, directions), directions]
-    if prior is not None:
-        features.append(prior.features(views.cameras.height, views.cameras.width))
-    return torch.cat(features, dim=-1)
+    return torch.cat((colors, torch.linalg.cross(origins / unit, directions), directions), dim=-1)
 
 
 class Tokenizer(nn.Module):
     """Linear embedding of p x p patches of pixels, then LayerNorm, with or without a bias."""
 
-    def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS, bias: bool = True):
+    def __init__(self, patch: int, width: int, bias: bool = True):
         super().__init__()
         self.patch = patch
-        self.embed = nn.Linear(channels * patch**2, width, bias=False)
+        self.embed = nn.Linear(PIXEL_CHANNELS * patch**2, width, bias=False)
         self.norm = nn.LayerNorm(width, bias=bias)
 
     def forward(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
@@ -113,13 +109,8 @@ class Layers(nn.ModuleList):
 
     checkpointing = False
 
-    def forward(
-        self, tokens: Float[Tensor, "B V h w d"], skip_layers: Collection[nn.Module] = ()
-    ) -> Float[Tensor, "B V h w d"]:
-        """Apply the layers in order, except `skip_layers`."""
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
         for layer in self:
-            if layer in skip_layers:
-                continue
             if self.checkpointing and torch.is_grad_enabled():
                 contexts = (nullcontext(), _without_running_means(layer))
                 tokens = checkpoint(

@@ -1,9 +1,7 @@
-"""The base of every network from views to Gaussians, and what it need not compute."""
+"""The base of every network from views to Gaussians."""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection
-from dataclasses import replace
 from typing import Annotated
 
 import torch
@@ -14,23 +12,10 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
-from asysplat.kernels.dispatch import without_autocast
 from asysplat.models.head import GaussianHead
-from asysplat.models.layers import PIXEL_CHANNELS, Layers, Widths, pixel_features
-from asysplat.models.prior import PRIOR_CHANNELS, Prior
-from asysplat.ranges import Fraction, PositiveFraction, configured
+from asysplat.models.layers import Layers, Widths, pixel_features
+from asysplat.ranges import Fraction, configured
 from asysplat.scene import Gaussians, Views
-
-
-@dataclass(frozen=True, config=configured("speed"))
-class EarlyExit:
-    """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing."""
-
-    skip_layers_above: PositiveFraction | None = None  # skips the network's `skippable_layers`
-    skip_network_above: PositiveFraction | None = None  # the Gaussians are the prior's own
-
-
-EXACT = EarlyExit()
 
 
 @dataclass(frozen=True, config=configured("model.prune"))
@@ -67,32 +52,27 @@ class Network(nn.Module, ABC):
 
     Args:
         patch: pixels along a side of its largest patches; image sides must be multiples of it.
-        prior: views and the size of the head's grid -> `Prior`; or None.
         prune: selects among the predicted Gaussians; None keeps all.
     """
 
     view_counts = (1, math.inf)  # least and greatest number of input views
 
-    def __init__(self, patch: int, prior: nn.Module | None = None, prune: Prune | None = None):
+    def __init__(self, patch: int, prune: Prune | None = None):
         super().__init__()
-        self.patch, self.prior, self.prune = patch, prior, prune
-        self._early_exit = EXACT
-        self.early_exit_fractions: dict[str, float] = {}
+        self.patch, self.prune = patch, prune
 
     def forward(self, views: Views, prune: bool = True) -> Gaussians:
         """Predict Gaussians [..., N] from views [..., V]; all of them if not `prune`.
 
         Raises:
             InputError: image sides that are no multiples of `patch`, or a number of views outside
-                `view_counts`; outside of training, invalid views, or early exit for several scenes
-                at a time.
+                `view_counts`; outside of training, invalid views.
         """
         self.check_size(views.cameras.height, views.cameras.width)
         self.check_views(views.num_views)
         if not (self.training or views.images.is_meta or is_fake(views.images)):
             views.validate("the network's views")  # in training the data module does
         views, batch = views.decoded(), views.images.shape[:-4]
-        self.early_exit_fractions.clear()
         gaussians = self.predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
         if prune:
             gaussians = self.select(gaussians)
@@ -110,11 +90,6 @@ class Network(nn.Module, ABC):
         """Return the fraction of parameters outside an appearance branch: all."""
         return 1.0
 
-    @property
-    def pixel_channels(self) -> int:
-        """The number of input channels of a tokenizer, for each pixel."""
-        return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
-
     def describe(self) -> str:
         """Return the number of parameters, in a line."""
         return f"{sum(p.numel() for p in self.parameters()) / 1e6:.2f}M parameters"
@@ -124,24 +99,6 @@ class Network(nn.Module, ABC):
         for module in self.modules():
             if isinstance(module, Layers):
                 module.checkpointing = checkpointing
-
-    @property
-    def early_exit(self) -> EarlyExit:
-        """The thresholds of predictions outside of training; see `check_early_exit`."""
-        return self._early_exit
-
-    @early_exit.setter
-    def early_exit(self, early_exit: EarlyExit) -> None:
-        self.check_early_exit(early_exit)
-        self._early_exit = early_exit
-
-    def check_early_exit(self, early_exit: EarlyExit) -> None:
-        """Raise InputError for early exit without a prior, whose confidence it depends on."""
-        if early_exit != EXACT and self.prior is None:
-            raise InputError(
-                "speed: this model has no prior, whose confidence early exit needs: set "
-                "speed=exact, or model/prior=plane_sweep."
-            )
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError unless both sides are multiples of `patch`."""
@@ -164,69 +121,21 @@ class Network(nn.Module, ABC):
 
 
 class TokenNetwork(Network):
-    """A network of tokens, which a head decodes to a grid of Gaussians for each view.
-
-    Outside of training it exits early at the thresholds of `early_exit`, by default never;
-    `early_exit_fractions` has the fractions that the last prediction skipped: of the network (0 or
-    1) and of its layers.
-    """
+    """A network of tokens, which a head decodes to a grid of Gaussians for each view."""
 
     head: GaussianHead
 
-    def __init__(
-        self, widths: Widths, patch: int, prior: nn.Module | None, prune: Prune | None = None
-    ):
-        super().__init__(patch, prior, prune)
+    def __init__(self, widths: Widths, patch: int, prune: Prune | None = None):
+        super().__init__(patch, prune)
         self.widths = widths
-
-    @property
-    def skippable_layers(self) -> Collection[nn.Module]:
-        """The layers that early exit may skip."""
-        return ()
-
-    def run_prior(self, views: Views) -> Prior | None:
-        """Run the prior, on the head's grid; None without one."""
-        if self.prior is None:
-            return None
-        height, width = (s // self.head.stride for s in (views.cameras.height, views.cameras.width))
-        with torch.no_grad(), without_autocast(views.images):
-            return self.prior(views, (height, width))
 
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V h w, of the head's grid."""
-        if not (self.training or self.early_exit == EXACT):
-            return self.predict_with_early_exit(views)
-        prior = self.run_prior(views)
-        pixels = pixel_features(views, prior, self.head.unit(views))
-        return self.head(self.tokens(pixels), views, prior)
-
-    def predict_with_early_exit(self, views: Views) -> Gaussians:
-        """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`."""
-        if len(views.images) != 1:
-            raise InputError(
-                f"speed: the network got {len(views.images)} scenes at a time, but early exit "
-                "decides for one: give one scene at a time, or set speed=exact."
-            )
-        prior = self.run_prior(views)
-        assert prior is not None  # see `check_early_exit`
-        confidence, speed = prior.confidence.mean().item(), self.early_exit
-        thresholds = (speed.skip_network_above, speed.skip_layers_above)
-        skip_network, skip_layers = (limit and confidence >= limit for limit in thresholds)
-        if skip_network:
-            self.early_exit_fractions |= {"network": 1.0, "layers": 1.0}
-            gaussians = self.head(None, views, prior)
-            return replace(gaussians, sh=gaussians.sh[..., :1, :])  # the others are 0
-        skipped = self.skippable_layers if skip_layers else ()
-        layers = sum(len(m) for m in self.modules() if isinstance(m, Layers))
-        self.early_exit_fractions |= {"network": 0.0, "layers": len(skipped) / layers}
-        pixels = pixel_features(views, prior, self.head.unit(views))
-        return self.head(self.tokens(pixels, skipped), views, prior)
+        return self.head(self.tokens(pixel_features(views, self.head.unit(views))), views)
 
     @abstractmethod
-    def tokens(
-        self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
-    ) -> Float[Tensor, "B V h w d"]:
-        """Compute the tokens that the head decodes from `pixel_features`, without `skip_layers`."""
+    def tokens(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
+        """Compute the tokens that the head decodes from `pixel_features`."""
 
     def describe(self) -> str:
         """Return the number of parameters and the widths, in a line."""

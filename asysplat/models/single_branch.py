@@ -1,6 +1,6 @@
 """Models of one branch: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,7 @@ class SingleBranch(TokenNetwork):
     """Tokens of one patch size through all stages; every pixel gives a Gaussian.
 
     Args:
-        widths, prior, prune: see TokenNetwork; `widths.fine` is not used.
+        widths, prune: see TokenNetwork; `widths.fine` is not used.
         stage_ratios, stage_layers, blocks: see AsySplat; each stage has a layer mix.
         merges: whether 2 x 2 tokens become one, before each stage.
         patch: side of a token's patch before any merge.
@@ -35,13 +35,10 @@ class SingleBranch(TokenNetwork):
         head: Callable[..., GaussianHead],
         patch: int = 8,
         global_tokens: int = 0,
-        prior: nn.Module | None = None,
         prune: Prune | None = None,
     ):
-        super().__init__(widths, patch * 2 ** sum(merges), prior, prune)
-        self.tokenizer = build_component(
-            Tokenizer, patch, widths.stages[0], self.pixel_channels, bias=False
-        )
+        super().__init__(widths, patch * 2 ** sum(merges), prune)
+        self.tokenizer = build_component(Tokenizer, patch, widths.stages[0], bias=False)
         shapes = widths.stage_shapes(stage_ratios, stage_layers=stage_layers, merges=merges)
         self.stages = nn.ModuleList(
             build_component(Stage, previous.width, shape, layers, blocks, merge, global_tokens > 0)
@@ -61,15 +58,13 @@ class SingleBranch(TokenNetwork):
             self.global_tokens = nn.Parameter(start)
         self.head = build_component(head, widths.stages[-1], self.patch, self.patch)
 
-    def tokens(
-        self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
-    ) -> Float[Tensor, "B V h w d"]:
+    def tokens(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
         tokens = self.tokenizer(pixels)
         global_tokens = None
         if self.global_tokens is not None:
             global_tokens = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
-            tokens, global_tokens = stage(tokens, skip_layers, global_tokens)
+            tokens, global_tokens = stage(tokens, global_tokens)
         return tokens
 
 

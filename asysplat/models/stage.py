@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -60,16 +60,15 @@ class Stage(nn.Module):
     def forward(
         self,
         tokens: Float[Tensor, "B V h w d"],
-        skip_layers: Collection[nn.Module] = (),
         global_tokens: Float[Tensor, "B G d"] | None = None,
     ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
         """Return the tokens, and the global tokens if there are any, after this stage."""
         tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
         if global_tokens is None:
-            return self.layers(tokens, skip_layers), None
+            return self.layers(tokens), None
         sequence = torch.cat((self.project(global_tokens), tokens.flatten(1, 3)), dim=1)
         # As one row of one image: none of these layers depends on the tokens' places.
-        sequence = self.layers(sequence[:, None, None], skip_layers)[:, 0, 0]
+        sequence = self.layers(sequence[:, None, None])[:, 0, 0]
         count = global_tokens.shape[1]
         return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
 

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.kernels.dispatch import to_float64
+from asysplat.models.prior.prior import DepthEstimate
 from asysplat.refinement.init import MIN_CONFIDENCE, depth_views, sweep
 from asysplat.scene import Cameras, Views
 
@@ -26,17 +27,22 @@ PREDICTED_BY = 4  # inputs on whose exposure that of another photograph is based
 
 
 @torch.no_grad()
-def find_exposures(views: Views) -> Float[Tensor, "V 3"] | None:
+def find_exposures(
+    views: Views, estimate: DepthEstimate | None = None
+) -> Float[Tensor, "V 3"] | None:
     """Estimate the log gains of photographs, of mean 0 in each channel.
 
     The places that two of them show come from the plane sweep, whose costs do not depend on
     exposure; the medians of their log ratios are the differences of log gains, and the gains fit
     those of all pairs (as in panoramas, Brown and Lowe 2007). None if they explain little of the
     disagreement, so that it is of the light, or if alphas say that the photographs are composed.
+    An `estimate` is that of `sweep`.
     """
     if views.alphas is not None:
         return None
-    pairs = [pair for pair in _compare(views) if len(pair[1]) >= MIN_PLACES]
+    pairs = [
+        pair for pair in _compare(views, estimate or sweep(views)) if len(pair[1]) >= MIN_PLACES
+    ]
     if not pairs:
         return None
     medians = torch.stack([ratios.median(0).values for _, ratios in pairs])
@@ -81,9 +87,11 @@ def predict_exposures(
     return explained * _nearest_mean(exposures, cameras.distances(inputs))
 
 
-def _compare(views: Views) -> Iterator[tuple[tuple[int, int], Float[Tensor, "places 3"]]]:
+def _compare(
+    views: Views, estimate: DepthEstimate
+) -> Iterator[tuple[tuple[int, int], Float[Tensor, "places 3"]]]:
     """Yield pairs of photographs, and the log ratios of their colors at places that both show."""
-    swept, estimate = depth_views(views), sweep(views)
+    swept = depth_views(views)
     inverse, known = estimate.inverse_depth[0], estimate.confidence[0] > MIN_CONFIDENCE
     known &= inverse > 0
     small, rows = views.resized(*inverse.shape[-2:]), {view: row for row, view in enumerate(swept)}

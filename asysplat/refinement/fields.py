@@ -126,6 +126,11 @@ class Motions:
         self._rate = rate
         self._adam = SelectiveAdam({"poses": torch.zeros(count, 2, 3, device=device)}, eps=1e-8)
 
+    def append(self, count: int) -> None:
+        """Add so many cameras that did not move."""
+        motions = self._adam.parameters["poses"]
+        self._adam.append({"poses": motions.new_zeros(count, 2, 3)})
+
     def leaves(self) -> list[Float[Tensor, "V 2 3"]]:
         """Return the motions of all cameras as a leaf of a graph; none with rate 0."""
         motions = self._adam.parameters.values() if self._rate else ()

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from asysplat.data.selection import evenly_spaced
 from asysplat.errors import InputError
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.kernels.dispatch import to_float64
 from asysplat.models.network import Network
-from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
+from asysplat.models.prior import PlaneSweep, Prior
+from asysplat.models.prior.plane_sweep import gaussians_of_estimate
 from asysplat.models.prior.prior import DepthEstimate
+from asysplat.refinement.footprints import footprints
 from asysplat.refinement.hull import within_hull
-from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.rendering import INRIA
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -29,7 +31,6 @@ MAX_ERROR = 0.5  # difference of log depths beyond which nothing is pulled: the 
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
 POINT_OPACITY = 0.1
 SPREAD = 0.5  # standard deviation of a Gaussian, in sides of the cell that it covers
-PIXEL_SPREAD = 0.18  # the same, in pixels, where those of other views lie between
 
 
 @torch.no_grad()
@@ -72,11 +73,13 @@ def initial_gaussians(
         size = small.cameras.height // stride, small.cameras.width // stride
         batch = small.map(lambda tensor: tensor[None])
         if init == "depth":
-            prior = DepthPrior()(batch, size)
+            assert batch.depths is not None  # refused above
+            prior = Prior.from_depth_maps(batch.depths, batch, size)
         else:
             prior = Prior.from_estimate(estimate or sweep(inputs), batch, size)
-        gaussians = gaussians_from_prior(views, prior)
-        pixels = longest / max(prior.distance.shape[-2:])
+        placed = prior.gaussians(views.map(lambda tensor: tensor[None]), SPREAD)
+        gaussians = without_invisible(placed.map(lambda tensor: tensor[0]))
+        pixels = longest / max(size)
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
     if inputs.alphas is not None:
@@ -87,33 +90,28 @@ def initial_gaussians(
 @torch.no_grad()
 def sweep(views: Views) -> DepthEstimate:
     """Estimate the depths of DEPTH_VIEWS at most, [1, V], by a plane sweep."""
-    return PlaneSweepPrior().sweep(views.select(depth_views(views)).map(lambda x: x[None]))
+    return PlaneSweep().sweep(views.select(depth_views(views)).map(lambda x: x[None]))
 
 
 @torch.no_grad()
 def gaussians_of_pixels(views: Views, estimate: DepthEstimate) -> Gaussians:
-    """Place a Gaussian at the surface point of each pixel of the `sweep` of views.
+    """Place a Gaussian at the surface point of each pixel of the views of a `sweep`.
 
     They are drawn as they are: merged ones are blurred until steps sharpen them.
     """
-    some = views.select(depth_views(views))
-    height, width = estimate.inverse_depth.shape[-2:]
-    batch = some.map(lambda tensor: tensor[None])
-    prior = Prior.from_estimate(estimate, batch, (height, width))
-    gaussians = gaussians_from_prior(some, prior, PIXEL_SPREAD)
+    batch = views.select(depth_views(views)).map(lambda tensor: tensor[None])
+    gaussians = without_invisible(gaussians_of_estimate(estimate, batch).map(lambda x: x[0]))
     return gaussians if views.alphas is None else within_hull(gaussians, views)
 
 
 class KnownDepths:
-    """The plane sweep's depths of DEPTH_VIEWS at most, where other views confirm them.
+    """The depths of a `sweep` of views, where other views confirm them.
 
     Steps would give them up: without texture, photographs are drawn from wrong depths, too.
     """
 
-    @torch.no_grad()
-    def __init__(self, views: Views):
-        found = sweep(views)
-        self._maps = torch.stack((found.inverse_depth[0], found.confidence[0]), dim=1)
+    def __init__(self, views: Views, estimate: DepthEstimate):
+        self._maps = torch.stack((estimate.inverse_depth[0], estimate.confidence[0]), dim=1)
         self._rows = {view: row for row, view in enumerate(depth_views(views))}
 
     def error(self, depth: Float[Tensor, "1 H W"], view: int) -> Tensor:
@@ -132,26 +130,6 @@ class KnownDepths:
 
 def depth_views(views: Views) -> list[int]:
     return evenly_spaced(range(views.num_views), min(DEPTH_VIEWS, views.num_views))
-
-
-def gaussians_from_prior(views: Views, prior: Prior, spread: float = SPREAD) -> Gaussians:
-    """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
-
-    Its standard deviation is `spread` pixels of these. Those of opacities that are too small to be
-    drawn are left out, unless that is all of them.
-    """
-    size = tuple(prior.distance.shape[-2:])
-    cameras = views.cameras.resized(*size)
-    origins, directions = cameras.rays()
-    distance = prior.distance[0].to(directions)
-    colors = F.interpolate(views.images, size, mode="area").movedim(1, -1)
-    gaussians = isotropic_gaussians(
-        (origins + distance[..., None] * directions).flatten(0, 2),
-        (distance / cameras.intrinsics[:, 0, 0, None, None] * spread).flatten(),
-        prior.opacity[0].to(directions).flatten(),
-        colors.flatten(0, 2),
-    )
-    return without_invisible(gaussians)
 
 
 def without_invisible(gaussians: Gaussians) -> Gaussians:

@@ -15,7 +15,7 @@ STEPS_PAY_FROM = 2.2  # times the seconds of the plane sweep, of two cores
 def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gaussians:
     """Compute the Gaussians of a scene: a plane sweep's, refined for the time that is left.
 
-    Where that is hardly as much as the sweep took, they are one for each of its pixels instead. The
+    Where that is hardly as much as the sweep took, they are one for each pixel instead. The
     first call in a process compiles its kernels beside these seconds.
 
     Args:
@@ -41,4 +41,4 @@ def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gauss
     limit = settings.initial_limit
     start = initial_gaussians("plane_sweep", views, limit, estimate=estimate)
     left = max(1e-3, seconds - (time.perf_counter() - began))
-    return refine(start, views, settings, seconds=left, seed=seed)
+    return refine(start, views, settings, seconds=left, seed=seed, estimate=estimate)

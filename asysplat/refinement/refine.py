@@ -12,11 +12,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.kernels.dispatch import check_device
+from asysplat.models.prior.prior import DepthEstimate
 from asysplat.ops.image_loss import image_loss
 from asysplat.ranges import Count, Positive, check_options
 from asysplat.refinement.blur import find_blurred
@@ -31,14 +32,15 @@ from asysplat.refinement.fields import (
     Parameters,
     correct_poses,
 )
+from asysplat.refinement.footprints import footprints, random_order
 from asysplat.refinement.hull import within_hull
-from asysplat.refinement.init import KnownDepths
-from asysplat.refinement.isotropic import footprints, random_order
+from asysplat.refinement.init import KnownDepths, initial_gaussians, sweep
 from asysplat.refinement.settings import DEFAULT, RefinementSettings
 from asysplat.refinement.transients import MOMENTS, find_transients
 from asysplat.rendering import blending_weights, render
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Cameras, Gaussians, Views
 
+COVERED = 0.5  # opacity of a pixel above which a place is not new
 SEEN = 0.2  # least sum of blending weights, in pixels: below .05 are 10 %, below .5 33 % of all
 
 
@@ -81,6 +83,7 @@ class Refinement:
         background: RGB; None: what the views show behind an object, else their mean color.
         settings: what is optimized, and how.
         seed: seed of the order of views and of new Gaussians.
+        estimate: that of `sweep`, if it is there; else the views are swept where depths are kept.
     """
 
     def __init__(
@@ -90,19 +93,46 @@ class Refinement:
         background: Float[Tensor, "3"] | None = None,
         settings: RefinementSettings = DEFAULT,
         seed: int = 0,
+        estimate: DepthEstimate | None = None,
     ):
         if gaussians.num_gaussians == 0:
             raise InputError("refine got no Gaussians: start from at least one.")
         gaussians.validate("refine's gaussians")
-        self.views = self._given = views = views.validate("refine's views").decoded()
+        views = views.validate("refine's views").decoded()
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
-        self.settings = settings
+        self.settings, self._estimate = settings, estimate
         if background is None:
             background = views.color_behind(views.mean_color())
         self.background = background
         self._generator = torch.Generator(gaussians.means.device).manual_seed(seed)
-        self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.motions = Motions(views.num_views, settings.rates.poses, views.images.device)
+        self._steps = self._rounds = self._comparisons = 0
+        self._take(views)
+        self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
+        self._densifier = self._make_densifier()
+
+    @torch.no_grad()
+    def add(self, views: Views) -> None:
+        """Take more photographs, in the frame and the size of the first ones.
+
+        Where no Gaussian covers what they show, those of a plane sweep of all are added.
+        """
+        views = views.validate("Refinement.add's views").decoded()
+        check_device("Refinement.add", "views", views.images, "the first", self.background)
+        self._take(self._given.join(views))
+        self.motions.append(views.num_views)
+        self._estimate = sweep(self.views)
+        self.__dict__.pop("_known_depths", None)
+        limit = max(1, self._max_gaussians - len(self.fields))
+        found = initial_gaussians("plane_sweep", self.views, limit, estimate=self._estimate)
+        found = found.keep(~is_covered(found.means, self.fields.gaussians(), views.cameras))
+        if found.num_gaussians:
+            self.fields.append(found, self._units(found.means))
+        self._densifier = self._make_densifier()
+
+    def _take(self, views: Views) -> None:
+        """Take views for the next steps, in a new order."""
+        settings, self.views, self._given = self.settings, views, views
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = random_order(views.num_views, self._generator)
@@ -110,13 +140,11 @@ class Refinement:
         if settings.robust:
             found = find_blurred(views.images, views.cameras)
             self._blurred = torch.nonzero(found)[:, 0].tolist()
-        self._steps = self._rounds = self._comparisons = 0
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
-        self._densifier = self._make_densifier()
 
     @cached_property
     def _known_depths(self) -> KnownDepths:
-        return KnownDepths(self.views)
+        return KnownDepths(self.views, self._estimate or sweep(self.views))
 
     @property
     def gaussians(self) -> Gaussians:
@@ -266,6 +294,7 @@ def refine(
     steps: int | None = None,
     background: Float[Tensor, "3"] | None = None,
     seed: int = 0,
+    estimate: DepthEstimate | None = None,
     watch: Callable[[RefinementProgress, Refinement], bool] | None = None,
 ) -> Gaussians:
     """Refine Gaussians for some seconds or steps, at most for the settings' `max_steps`.
@@ -274,7 +303,7 @@ def refine(
     the same inputs and seed give the same bits on a CPU.
 
     Args:
-        gaussians, views, background, settings, seed: see `Refinement`.
+        gaussians, views, background, settings, seed, estimate: see `Refinement`.
         seconds, steps: give one of them.
         watch: called after each step; ends the refinement if it returns True.
 
@@ -287,7 +316,7 @@ def refine(
         >>> gaussians = refine(load("shipped")(views), views, steps=5)
     """
     budget = read_budget(seconds, steps)
-    refinement = Refinement(gaussians, views, background, settings, seed)
+    refinement = Refinement(gaussians, views, background, settings, seed, estimate)
     if seconds is not None:  # steps with few Gaussians compile the kernels before the time runs
         few, one_view = gaussians.map(lambda field: field[:10]), replace(settings, views_per_step=1)
         small = Refinement(few, views.select([0]), settings=one_view)
@@ -297,6 +326,20 @@ def refine(
     run_steps(refinement, budget, watch, settings.max_steps(views.num_views))
     refined = refinement.gaussians
     return refined if views.alphas is None else within_hull(refined, views)
+
+
+def is_covered(
+    points: Float[Tensor, "P 3"], gaussians: Gaussians, cameras: Cameras
+) -> Bool[Tensor, "P"]:
+    """Return whether Gaussians hide what is behind them wherever a camera shows a point."""
+    covered = torch.ones_like(points[:, 0], dtype=torch.bool)
+    for view in range(cameras.num_views):
+        camera = cameras.select([view])
+        (alpha,) = render(gaussians, camera, depth=False).alpha
+        (pixels,), _, (inside,) = camera.project(points)
+        x, y = pixels[inside].long().unbind(-1)
+        covered[inside] &= alpha[y, x] > COVERED
+    return covered
 
 
 def without_unseen(gaussians: Gaussians, inputs: Views) -> Gaussians:

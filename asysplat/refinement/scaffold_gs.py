@@ -23,7 +23,7 @@ from asysplat.ranges import Count, Fraction, configured
 from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.densification.clone_split import screen_gradients
 from asysplat.refinement.fields import Parameters
-from asysplat.refinement.isotropic import random_order
+from asysplat.refinement.footprints import random_order
 from asysplat.refinement.refine import RefinementProgress, read_budget, run_steps
 from asysplat.refinement.settings import read_settings
 from asysplat.rendering import Rendering, render

@@ -33,7 +33,9 @@ def trial_gain(
     estimate, errors = sweep(rest), []
     for tried in (settings, others):
         start = initial_gaussians("plane_sweep", rest, tried.initial_limit, estimate=estimate)
-        refined = refine(start, rest, tried, steps=STEPS, background=background, seed=seed)
+        refined = refine(
+            start, rest, tried, steps=STEPS, background=background, seed=seed, estimate=estimate
+        )
         image = render(refined, target.cameras, background, masks=target.masks).image
         errors.append((target.masked(image) - target.images).square().mean((-3, -2, -1)))
     gains = 10 * (errors[0] / errors[1]).log10()

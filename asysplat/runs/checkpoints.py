@@ -1,6 +1,6 @@
 """Find the checkpoint to resume or to start from, and check that it fits the model.
 
-A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as in checkpoints/.
+A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors).
 """
 
 import zipfile
@@ -15,10 +15,8 @@ from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
-from asysplat.root import CHECKPOINTS
 from asysplat.runs.run_config import flat_options
 
-SHIPPED = CHECKPOINTS / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # checkpoints of a run to resume from
 # Options that change no weight.
 WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.", "trainer.num_sanity_val_steps")
@@ -127,21 +125,15 @@ def check_checkpoint(path: Path, module: nn.Module) -> None:
     ]
     if not lines:
         return
-    if path == SHIPPED:
-        raise InputError(
-            f"the shipped weights do not fit this model, {len(lines)} of {len(names)} differ: they "
-            "are of model=asysplat_plane_sweep at scale=laptop; give these options, and none that "
-            "changes the network."
-        )
     raise InputError(
         f"{path} does not fit this model, {len(lines)} of {len(names)} weights differ: "
         f"{', '.join(lines[:5])}{', ...' if len(lines) > 5 else ''}; give the options that "
-        "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
+        "it was trained with (a run's config.yaml)."
     )
 
 
 def load_weights(path: str | None, module: nn.Module, option: str = "init_path") -> None:
-    """Load the weights of a .ckpt or .safetensors file, or those in checkpoints/: "shipped"."""
+    """Load the weights of a .ckpt or .safetensors file; none if `path` is None."""
     if path is None:
         return
     file = existing_weights(path, option)
@@ -159,18 +151,11 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
     module.load_state_dict(weights)
 
 
-def weights_file(path: str) -> Path:
-    """Return the file that `init_path` names."""
-    return SHIPPED if path == "shipped" else Path(path)
-
-
 def existing_weights(path: str, option: str = "init_path") -> Path:
     """Return the file that an option names; raise InputError if there is none."""
-    file = weights_file(path)
+    file = Path(path)
     if not file.is_file():
-        raise InputError(
-            f"{option}={path} does not exist: name a .ckpt or .safetensors file, or shipped."
-        )
+        raise InputError(f"{option}={path} does not exist: name a .ckpt or .safetensors file.")
     return file
 
 

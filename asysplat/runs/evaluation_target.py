@@ -51,10 +51,12 @@ class EvaluationTarget:
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
     """Find the target of evaluate.py from its options and the overrides of its command."""
     sources = [name for name in SOURCES if options.get(name) is not None]
-    if len(sources) != 1:
+    model = dict(override.partition("=")[::2] for override in overrides).get("model")
+    if len(sources) > 1 or not (sources or model):
         raise InputError(
             f"{' and '.join(sources) or 'nothing'} is given to evaluate: give one of run=last, "
-            "init_path=shipped, gaussians=FOLDER, images=FOLDER and refinement=3dgs."
+            "init_path=FILE, gaussians=FOLDER, images=FOLDER and refinement=3dgs, or model=NAME, "
+            "as it is without training."
         )
     system = next(iter(set(sources) & set(SYSTEMS)), None)
     if system is None and options.system is not None:
@@ -63,7 +65,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
             "refinement=...: give both, or neither."
         )
     if options.write_gaussians is not None:
-        _check_predicted(options)
+        _check_predicted(options, system)
     for name in ("write_gaussians", "write_images"):
         if options[name] is not None:
             _check_new(Path(options[name]), name)
@@ -84,7 +86,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     check_training(config)
     fingerprint = _describe(config, options)
     if system is None:
-        stem = Path(options.init_path).stem
+        stem = Path(str(options.init_path or model)).stem
     else:
         stem, made_of = _describe_source(system, options, overrides)
         fingerprint |= describe_system(config, options.system or stem, made_of)
@@ -149,12 +151,12 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     return described
 
 
-def _check_predicted(options: DictConfig) -> None:
+def _check_predicted(options: DictConfig, system: str | None) -> None:
     """Check that there are predictions to write."""
-    if options.run is None and options.init_path is None:
+    if system is not None:
         raise InputError(
-            f"write_gaussians={options.write_gaussians} writes what a network predicts, of run=... "
-            "or init_path=...: give one of these, or leave it out."
+            f"write_gaussians={options.write_gaussians} writes what a model predicts, of run=..., "
+            "init_path=... or model=...: give one of these, or leave it out."
         )
 
 

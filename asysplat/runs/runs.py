@@ -17,7 +17,6 @@ from omegaconf import MISSING, DictConfig, open_dict
 from asysplat.data.sources import tested_sets
 from asysplat.errors import InputError
 from asysplat.files import read_json
-from asysplat.runs.checkpoints import weights_file
 from asysplat.runs.machine import revision
 from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
@@ -106,7 +105,7 @@ def data_of(config: DictConfig) -> dict[str, str]:
         "run/data/root": name_of(data.get("root")),
         "run/data/test_root": name_of(data.get("test_root")),
         "run/data/index": content_of(data.get("index")),
-        "run/init_path": content_of(config.init_path and weights_file(config.init_path)),
+        "run/init_path": content_of(config.init_path),
     }
     test_sets = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
     for name, options in test_sets.items():

@@ -44,7 +44,10 @@ def check_stages(stages: Sequence[DictConfig]) -> None:
             check_training(stage)
             with torch.device("meta"):
                 net = instantiate(stage.model)
-            net.check_early_exit(instantiate(stage.speed))
+            if next(net.parameters(), None) is None:
+                raise InputError(
+                    "this model has nothing to train: measure it, evaluate.py model=plane_sweep."
+                )
             test_size = data.test_size if stage is stages[-1] else None  # that of all stages
             for height, width in filter(None, ((data.height, data.width), test_size)):
                 net.check_size(height, width)

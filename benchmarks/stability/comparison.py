@@ -140,10 +140,8 @@ def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str
         for output, generator in zip(outputs.values(), random, strict=True)
     ]
     leaf_inputs = [inputs[name] for name in leaves]
-    # The opacities and colors of a network with a prior depend on no leaf.
-    pairs = zip(outputs.values(), weights, strict=True)
-    differentiable, weights = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
-    grads = torch.autograd.grad(differentiable, leaf_inputs, weights, materialize_grads=True)
+    values = list(outputs.values())
+    grads = torch.autograd.grad(values, leaf_inputs, weights, materialize_grads=True)
     named = {f"gradient of {name}": grad for name, grad in zip(leaves, grads, strict=True)}
     return {name: output.detach() for name, output in outputs.items()} | named
 

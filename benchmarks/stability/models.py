@@ -1,4 +1,4 @@
-"""The plane sweep, the prior and the whole network on hostile views."""
+"""The plane sweep, its Gaussians and the whole network on hostile views."""
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,7 +8,7 @@ import torch
 from torch.func import functional_call
 
 from asysplat.models.network import Network
-from asysplat.models.prior import PlaneSweepPrior
+from asysplat.models.prior import PlaneSweep
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras, Views
 from benchmarks.model import make_net
@@ -34,7 +34,7 @@ NETWORK_ROUNDINGS = 1024
 
 
 def depth_cases(plane_sweep: bool, counts: Sequence[int] = ()) -> list[StabilityCase]:
-    """List the cases of the plane sweep or of the prior; `counts` are numbers of views."""
+    """List the cases of the plane sweep or of its Gaussians; `counts` are numbers of views."""
     prefix, function = ("plane_sweep, ", _plane_sweep) if plane_sweep else ("", _prior)
 
     def measure(hostile: HostileViews) -> Result:
@@ -66,12 +66,13 @@ def _plane_sweep(tensors: Tensors) -> Tensors:
 
 
 def _prior(tensors: Tensors) -> Tensors:
-    images = tensors["images"]
-    prior = PlaneSweepPrior()(Views(_cameras(tensors), images), tuple(images.shape[-2:]))
+    views = Views(_cameras(tensors), tensors["images"])
+    gaussians = PlaneSweep()(views)
+    confidence = PlaneSweep().sweep(views).confidence.flatten(1)
     return {
-        "confidence": prior.confidence,
-        "confidence x log distance": prior.confidence * prior.distance.log(),
-        "opacity": prior.opacity,
+        "confidence x log size": confidence * gaussians.scales[..., 0].log(),
+        "opacity": gaussians.opacities,
+        "color": gaussians.sh,
     }
 
 
@@ -103,13 +104,6 @@ def network_cases(
 def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: bool) -> Result:
     """Compare a network with itself in float64; without gradients in fp16, where they underflow."""
     views, net = hostile.views(), copy.deepcopy(net).eval()
-    if net.prior is not None:
-        # Computed once, for both precisions: the plane of lowest cost is a discrete choice, which
-        # rounding may flip.
-        size = (hostile.side // net.head.stride,) * 2
-        prior = net.prior(views.map(lambda tensor: tensor[None]), size)
-        del net.prior
-        net.prior = lambda views, _: prior.to(views.images)
     if wild:
         net.head.decode.weight.data *= WILD_FACTOR
     weights = {name: parameter.detach() for name, parameter in net.named_parameters()}

@@ -149,11 +149,6 @@ def test_a_stage_sets_the_sizes_of_its_scale(composed, scale):
     assert composed(f"scale={scale}").stage == "stage1"
 
 
-def test_speeds_name_the_same_thresholds():
-    files = [OmegaConf.load(path) for path in (CONF / "speed").glob("*.yaml")]
-    assert len(files) == 3 and len({tuple(file) for file in files}) == 1
-
-
 def test_every_table_has_its_sweep():
     tables = Counter(table.key for table in find_tables("all") if table.rows)
     assert tables == Counter(path.stem for path in SWEEPS.glob("*.yaml"))

@@ -26,7 +26,6 @@ def make_views(rotations: torch.Tensor, centers: torch.Tensor) -> Views:
         cameras=Cameras(intrinsics, poses, HEIGHT, WIDTH),
         images=torch.rand(count, 3, HEIGHT, WIDTH),
         depths=torch.rand(count, HEIGHT, WIDTH) + 1,
-        point_depths=torch.rand(count, HEIGHT, WIDTH) + 1,
     )
 
 
@@ -64,7 +63,6 @@ def test_lengths_are_scaled_and_nothing_else_changes(pair):
         expected[:, :3, 3] *= frame.scale
         torch.testing.assert_close(relative(after, inputs), expected, atol=1e-5, rtol=0)
         torch.testing.assert_close(after.depths, before.depths * frame.scale)
-        torch.testing.assert_close(after.point_depths, before.point_depths * frame.scale)
         assert torch.equal(after.images, before.images)
         assert torch.equal(after.cameras.intrinsics, before.cameras.intrinsics)
 

@@ -1,6 +1,5 @@
 """Our numbers in the paper's tables: costs of every row, and runs matched by configuration."""
 
-import itertools
 import json
 from pathlib import Path
 
@@ -256,19 +255,3 @@ def test_broken_results_are_ignored(compose, tmp_path):
     (tmp_path / "run" / "metrics.json").write_text('{"test/procedural/psnr": 1}')
     with pytest.warns(UserWarning, match="is not the results of a finished run"):
         assert find_run(tmp_path, config) is None
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("table", load_paper("ours").values(), ids=lambda table: table.key)
-def test_rows_of_our_tables_are_those_of_their_sweeps(compose, table):
-    varied = dict(compose([f"sweeps={table.key}"]).hydra.sweeper.params)
-    varied.pop("seed")
-    choices = itertools.product(*(str(value).split(",") for value in varied.values()))
-    swept = [[f"{k}={v}" for k, v in zip(varied, row, strict=True)] for row in choices]
-    models = [
-        str(compose([f"sweeps={table.key}", *run]).model)
-        for runs in (swept, [row.run for row in table.rows])
-        for run in runs
-    ]
-    half = len(models) // 2
-    assert sorted(models[:half]) == sorted(models[half:]) and len(set(models)) == half

@@ -137,8 +137,7 @@ def test_unverified_rows_have_another_reading():
 
 def test_a_table_is_found_by_its_name():
     assert [table.number for table in find_tables("layers,mamba_ratio")] == ["6b", "A2"]
-    assert len(find_tables("all")) == 14
-    assert [table.number for table in find_tables("prior")] == [None]
+    assert len(find_tables("all")) == 13
     with pytest.raises(InputError, match=r"table=layer is unknown: did you mean layers"):
         find_tables("layer")
 

@@ -5,7 +5,7 @@ import torch
 
 from asysplat.data import ProceduralScene
 from asysplat.models.prior import Prior
-from asysplat.refinement.init import gaussians_from_prior, merge_to_limit
+from asysplat.refinement.init import SPREAD, merge_to_limit
 
 
 @pytest.fixture(scope="session")
@@ -28,5 +28,6 @@ def start(room):
     length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
     depths = torch.nn.functional.interpolate(views.depths[None], size)[0]
     distance = (depths * length)[None]
-    prior = Prior(distance, torch.ones_like(distance), torch.full_like(distance, 0.5))
-    return merge_to_limit(gaussians_from_prior(views, prior), views.cameras, 4.0, 10_000)
+    prior = Prior(distance, torch.full_like(distance, 0.5))
+    placed = prior.gaussians(views.map(lambda tensor: tensor[None]), SPREAD)
+    return merge_to_limit(placed.map(lambda tensor: tensor[0]), views.cameras, 4.0, 10_000)

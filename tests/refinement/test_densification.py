@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.geometry.motion import rotations
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.refinement.densification.clone_split import (
@@ -29,7 +30,6 @@ from asysplat.refinement.densification.spawn import (
     spawn_at_errors,
 )
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.refinement.settings import DEFAULT
 from asysplat.rendering import render
 from asysplat.scene import Cameras

@@ -6,22 +6,23 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.models.prior import Prior
 from asysplat.models.prior.prior import FREE_OPACITY
+from asysplat.refinement.footprints import footprints
 from asysplat.refinement.init import (
     MAX_OPACITY,
     MIN_OPACITY,
     POINT_OPACITY,
     SPREAD,
     gaussians_from_points,
-    gaussians_from_prior,
     initial_gaussians,
     merge_cells,
     merge_to_limit,
     sample_colors,
+    without_invisible,
 )
-from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.settings import DEFAULT
 from asysplat.scene import Cameras, Views
 
@@ -42,7 +43,12 @@ def colors(gaussians):
 def true_prior(views, opacity=0.5):
     length = views.cameras.pixel_directions().norm(dim=-1)
     distance = (views.depths * length)[None]
-    return Prior(distance, torch.ones_like(distance), torch.full_like(distance, opacity))
+    return Prior(distance, torch.full_like(distance, opacity))
+
+
+def gaussians_from_prior(views, prior):
+    placed = prior.gaussians(views.map(lambda tensor: tensor[None]), SPREAD)
+    return without_invisible(placed.map(lambda tensor: tensor[0]))
 
 
 def test_gaussians_of_a_prior_are_at_the_surface_points(small_room):
@@ -66,7 +72,7 @@ def test_a_prior_of_any_size_gives_a_gaussian_a_pixel_in_the_images_colors(size)
     """Of fewer pixels than the photographs, of more, and of such as do not divide them."""
     views = front_views(height=8, width=10)
     distance = torch.full((1, 1, *size), 2.0)
-    gaussians = gaussians_from_prior(views, Prior(distance, distance, distance / 4)).validate()
+    gaussians = gaussians_from_prior(views, Prior(distance, distance / 4)).validate()
     assert gaussians.num_gaussians == size[0] * size[1]
     if size == (8, 10):  # a focal length of 5: at a distance of 2, a pixel is 2 / 5 wide
         torch.testing.assert_close(gaussians.scales, torch.full((80, 3), SPREAD * 2 / 5))
@@ -83,10 +89,10 @@ def test_pixels_of_a_prior_that_nothing_shows_give_no_gaussian():
     views = front_views(height=8, width=10)
     distance = torch.full((1, 1, 4, 5), 2.0)
     opacity = torch.where(torch.rand(1, 1, 4, 5) < 0.5, FREE_OPACITY, 0.5)
-    every = gaussians_from_prior(views, Prior(distance, distance, torch.full_like(distance, 0.5)))
-    some = gaussians_from_prior(views, Prior(distance, distance, opacity))
+    every = gaussians_from_prior(views, Prior(distance, torch.full_like(distance, 0.5)))
+    some = gaussians_from_prior(views, Prior(distance, opacity))
     assert_equal(some, every.keep((opacity > FREE_OPACITY).flatten()))
-    none = Prior(distance, distance, torch.full_like(distance, FREE_OPACITY))
+    none = Prior(distance, torch.full_like(distance, FREE_OPACITY))
     assert torch.equal(gaussians_from_prior(views, none).means, every.means)
 
 

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from asysplat.data import ProceduralScene
-from asysplat.models import PlaneSweepPrior
 from asysplat.models.prior.prior import DepthEstimate
 from asysplat.ops.plane_sweep import Consistency
 from asysplat.refinement import DEFAULT, Refinement, init, refine
-from asysplat.refinement.init import KnownDepths, initial_gaussians
+from asysplat.refinement.init import KnownDepths, initial_gaussians, sweep
 from asysplat.rendering import render
 
 CONFIDENCE = torch.tensor([[0.9, 0.8, 0.4], [1.0, 0.6, 0.7]])
@@ -28,8 +27,7 @@ def test_the_error_by_hand(scene, monkeypatch):
     """Of six pixels one is unsure, one is unknown, one has no Gaussian, and one is far off."""
     maps = (values.expand(1, 2, 2, 3) for values in (INVERSE, CONFIDENCE))
     monkeypatch.setattr(init, "DEPTH_VIEWS", 2)
-    monkeypatch.setattr(PlaneSweepPrior, "sweep", lambda *_: DepthEstimate(*maps, NO_VOTES))
-    known = KnownDepths(scene)
+    known = KnownDepths(scene, DepthEstimate(*maps, NO_VOTES))
     depth = torch.tensor([[[2.2, 0.0, 7.0], [3.0, 2.0, 1.8]]], requires_grad=True)
     expected = 0.9 * torch.tensor(1.1).log() + 0.5 - 0.7 * torch.tensor(0.9).log()
     torch.testing.assert_close(known.error(depth, 0), expected / 6)
@@ -40,7 +38,7 @@ def test_the_error_by_hand(scene, monkeypatch):
 
 def test_steps_keep_depths_that_are_known(scene):
     """In 100 steps photographs alone, which are not sure, move surfaces farther from them."""
-    known, errors = KnownDepths(scene), {}
+    known, errors = KnownDepths(scene, sweep(scene)), {}
     for weight in (0.0, 0.1):
         settings = replace(DEFAULT, depth=weight, densify="none")
         start = initial_gaussians("plane_sweep", scene, settings.initial_limit)

@@ -15,6 +15,7 @@ from test_init import front_views
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.metrics import psnr
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.refinement import (
     DEFAULT,
     FEW,
@@ -30,7 +31,7 @@ from asysplat.refinement import (
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import correct_poses
-from asysplat.refinement.isotropic import footprints, isotropic_gaussians
+from asysplat.refinement.footprints import footprints
 from asysplat.rendering import render
 from asysplat.root import CONF
 from asysplat.scene import Gaussians, Views

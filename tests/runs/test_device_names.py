@@ -37,7 +37,7 @@ def test_apples_gpu_is_refused_with_its_reason(machine):
 
 @pytest.mark.medium
 def test_scripts_refuse_apples_gpu(run_script, tmp_path):
-    model = ("model=asysplat_plane_sweep", f"paths.logs={tmp_path}", "trainer.accelerator=mps")
-    result = run_script("evaluate.py", "init_path=shipped", *model)
+    model = ("model=plane_sweep", f"paths.logs={tmp_path}", "trainer.accelerator=mps")
+    result = run_script("evaluate.py", *model)
     assert result.returncode == 1
     assert "error: trainer.accelerator=mps is not supported: Apple's GPU" in result.stderr

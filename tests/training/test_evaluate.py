@@ -343,21 +343,17 @@ def refusal(result) -> str:
 
 REFUSED = {
     "nothing": ([], "nothing is given to evaluate: give one of"),
-    "two at once": (["run=last", "init_path=shipped"], "run and init_path is given"),
+    "two at once": (["run=last", "init_path=a.ckpt"], "run and init_path is given"),
     "no runs": (["run=last"], "run=last found no finished run in"),
     "no data": (["gaussians=none.ply"], "is measured on photographs of the same scenes: add data="),
-    "a name of nothing": (["init_path=shipped", "system=x"], "system=x names the system that made"),
+    "a name of nothing": (["init_path=a.ckpt", "system=x"], "system=x names the system that made"),
     "files to write": (
         ["gaussians=a", "data=files", "write_gaussians=b"],
-        "writes what a network predicts, of run=... or init_path=...",
+        "writes what a model predicts, of run=..., init_path=... or model=...",
     ),
     "post-optimization of images": (
         ["images=none", "data.test_scenes=1", "post_optimization_steps=3"],
         "post_optimization_steps=[3]: images, and Gaussians that depend on the view",
-    ),
-    "another model": (
-        ["init_path=shipped", "width=0.125"],
-        "the shipped weights do not fit this model, ",
     ),
 }
 

@@ -1,11 +1,9 @@
-"""Priors: surface depths known before the network runs; ours, not the paper's.
+"""Surfaces from posed images without training: a plane sweep, or known depth maps.
 
-A prior maps views and the size of the head's grid to a `Prior`. The tokenizers read its distance
-and confidence at each pixel; the head corrects its distance and starts from its opacity. Without
-one (`model/prior=none`) the network is the paper's.
+The start of a refinement, and by themselves a model that a trained one has to surpass.
 """
 
-from asysplat.models.prior.plane_sweep import PlaneSweepPrior
-from asysplat.models.prior.prior import PRIOR_CHANNELS, DepthPrior, PointsPrior, Prior
+from asysplat.models.prior.plane_sweep import PlaneSweep
+from asysplat.models.prior.prior import Prior
 
-__all__ = ["PRIOR_CHANNELS", "DepthPrior", "PlaneSweepPrior", "PointsPrior", "Prior"]
+__all__ = ["PlaneSweep", "Prior"]

@@ -12,10 +12,12 @@ from functools import reduce
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
+from asysplat.kernels.dispatch import without_autocast
+from asysplat.models.network import Network
 from asysplat.models.prior.fill import color_edges, fill_unknown
 from asysplat.models.prior.prior import DepthEstimate, Prior, count_votes, other_views
 from asysplat.models.prior.projections import (
@@ -26,7 +28,7 @@ from asysplat.models.prior.projections import (
     smallest_step,
 )
 from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
-from asysplat.scene import Cameras, Views
+from asysplat.scene import Cameras, Gaussians, Views
 
 PLANES = 64
 NEIGHBORS = 4
@@ -34,24 +36,35 @@ LONGEST_SIDE = 128  # greatest side of the swept images in pixels: more than twi
 FULL_CONTRAST = 1.0  # contrast of a sure depth: mean minus least cost, summed over four paths
 MIN_AGREEMENT = 0.5  # agreement above which a depth counts for the second sweep's range
 CONTRADICTION = 2.0  # one contradicting view takes two thirds of the confidence
+PIXEL_SPREAD = 0.18  # standard deviation in pixels: those of other views lie between
 LUMA = (0.299, 0.587, 0.114)
 
 
-class PlaneSweepPrior(nn.Module):
-    """Depth from `plane_sweep`, over images shrunk to a size that suits the number of planes.
+class PlaneSweep(Network):
+    """The Gaussians of a plane sweep alone, one for each pixel: nothing is trained.
 
-    The cameras set the range of depths, and in views with enough sparse points the points do.
+    Swept images are shrunk to a size that suits the number of planes.
+
+    Args:
+        planes, neighbors: see `plane_sweep`.
+        longest_side: greatest side of the swept images, in pixels.
     """
 
     def __init__(
         self, planes: int = PLANES, neighbors: int = NEIGHBORS, longest_side: int = LONGEST_SIDE
     ):
-        super().__init__()
+        super().__init__(patch=1)
         self.planes, self.neighbors, self.longest_side = planes, neighbors, longest_side
 
-    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        return Prior.from_estimate(self.sweep(views), views, size)
+    def predict(self, views: Views) -> Gaussians:
+        """Predict Gaussians [B, N] from views [B, V]; N = V H W.
 
+        Colors and places have gradients of the images and of the poses; depths have none.
+        """
+        with without_autocast(views.images):
+            return gaussians_of_estimate(self.sweep(views), views)
+
+    @torch.no_grad()
     def sweep(self, views: Views) -> DepthEstimate:
         """Estimate the depths of the views, [B, V], shrunk to at most `longest_side` pixels."""
         height, width, factor = views.cameras.height, views.cameras.width, 1
@@ -62,15 +75,17 @@ class PlaneSweepPrior(nn.Module):
         if views.masks is not None:  # what is masked out has no effect
             images = images.where(views.masks[..., None, :, :], 0.5)
         images = shrink(images, small.height, small.width)
-        ranges = None
-        if views.point_depths is not None:  # the nearest point in each block of pixels counts
-            inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
-            inverse = F.max_pool2d(inverse, factor).flatten(2)
-            ranges = observed_range(inverse, inverse > 0)
         masks = views.surfaces((small.height, small.width))
-        return plane_sweep(
-            images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges, masks=masks
-        )
+        return plane_sweep(images, small, planes=self.planes, neighbors=self.neighbors, masks=masks)
+
+
+def gaussians_of_estimate(estimate: DepthEstimate, views: Views) -> Gaussians:
+    """Place a Gaussian [B, V H W] at the surface point of each pixel of views [B, V].
+
+    They are drawn as they are: the views' own lie between each other.
+    """
+    size = views.cameras.height, views.cameras.width
+    return Prior.from_estimate(estimate, views, size).gaussians(views, PIXEL_SPREAD)
 
 
 def plane_sweep(
@@ -79,7 +94,6 @@ def plane_sweep(
     planes: int = PLANES,
     neighbors: int = NEIGHBORS,
     backend: str = "auto",
-    ranges: Float[Tensor, "B V 2"] | None = None,
     masks: Bool[Tensor, "B V H W"] | None = None,
 ) -> DepthEstimate:
     """Estimate the depth of every pixel: [B, V, H, W].
@@ -95,8 +109,6 @@ def plane_sweep(
         neighbors: most views that each view is compared with.
         backend: "reference" (torch, any device and float type), "cpu", "cuda", or "auto": the
             kernels of the device, and "reference" for float64.
-        ranges: least and greatest inverse depth of each view; where both are 0, and in all views
-            if None, they follow from the cameras.
         masks: False in pixels that have no confidence; None: in none.
     """
     _check(images, cameras, planes, neighbors)
@@ -104,7 +116,7 @@ def plane_sweep(
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     inverse, confidence, *votes = _plane_sweep(
-        images, intrinsics, poses, planes, neighbors, backend, ranges, masks
+        images, intrinsics, poses, planes, neighbors, backend, masks
     )
     return DepthEstimate(inverse, confidence, Consistency(*votes))
 
@@ -117,7 +129,6 @@ def _plane_sweep(
     planes: int,
     neighbors: int,
     backend: str,
-    ranges: Tensor | None,
     masks: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
@@ -125,10 +136,7 @@ def _plane_sweep(
     projections = PairwiseProjections.from_cameras(cameras)
     chosen = choose_neighbors(cameras, projections, neighbors)
     shortest = smallest_step(cameras, chosen)
-    visible = inverse_depth_range(cameras, projections, chosen)
-    if ranges is None:
-        ranges = visible
-    ranges = torch.where(ranges[..., 1:] > 0, ranges.to(visible), visible)
+    ranges = inverse_depth_range(cameras, projections, chosen)
     kernels = load_backend(backend, images)
 
     def sweep(
@@ -183,7 +191,7 @@ def _plane_sweep(
 
 
 @_plane_sweep.register_fake
-def _(images, intrinsics, cam_to_world, planes, neighbors, backend, ranges, masks):
+def _(images, intrinsics, cam_to_world, planes, neighbors, backend, masks):
     return tuple(torch.empty_like(images[:, :, 0]) for _ in range(6))
 
 

@@ -1,19 +1,19 @@
-"""A prior's maps, made from the depths of all views and from how many views confirm them."""
+"""Surfaces from the depths of all views and from how many views confirm them."""
 
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.models.prior.fill import color_edges, fill_unknown
 from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import Consistency, load_backend
-from asysplat.scene import TensorRecord, Views
+from asysplat.scene import Gaussians, TensorRecord, Views
 
-PRIOR_CHANNELS = 2
-UNKNOWN_DISTANCE = 10**0.5  # the middle of ResidualHead's range
+UNKNOWN_DISTANCE = 10**0.5  # the geometric mean of .1 and 100, the range of distances
 VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of the same surface
 SURFACE_OPACITY = 0.9  # joint opacity of all views that confirm a surface
 UNCERTAIN_SURFACE_OPACITY = 0.7  # the same of all views that may see a point of uncertain depth
@@ -31,14 +31,13 @@ class DepthEstimate:
 
 @dataclass(frozen=True)
 class Prior(TensorRecord):
-    """Distances at the pixels of the head's grid, and their confidence.
+    """Surfaces at the pixels of a grid on each view.
 
-    The opacity, to start from, is shared by the views that see the same surface, and FREE_OPACITY
-    where nothing is to be drawn.
+    The opacity is shared by the views that see the same surface, and FREE_OPACITY where nothing is
+    to be drawn.
     """
 
     distance: Float[Tensor, "B V h w"]  # along a pixel's ray, > 0, in scene units
-    confidence: Float[Tensor, "B V h w"]  # in [0, 1]
     opacity: Float[Tensor, "B V h w"]  # in (0, 1)
 
     @classmethod
@@ -56,49 +55,54 @@ class Prior(TensorRecord):
         not_occluded = votes.containing - votes.occluding
         unsure = _per_view_opacity(UNCERTAIN_SURFACE_OPACITY, not_occluded).logit()
         opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
-        inverse, confidence, opacity = (
+        inverse, opacity = (
             F.interpolate(values, size, mode="bilinear")
-            for values in (depth.inverse_depth, depth.confidence, opacity)
+            for values in (depth.inverse_depth, opacity)
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
         dropped = F.interpolate(in_free_space(votes).to(opacity), size, mode="area") > 0.5
         if (surfaces := views.surfaces(size)) is not None:
             dropped = dropped | ~surfaces
-        return cls(distance, confidence, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
+        return cls(distance, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
 
     @classmethod
-    def from_depths(
-        cls,
-        inverse: Float[Tensor, "B V h w"],
-        weight: Float[Tensor, "B V h w"],
-        confidence: Float[Tensor, "B V h w"],
-        views: Views,
+    def from_depth_maps(
+        cls, depths: Float[Tensor, "B V H W"], views: Views, size: tuple[int, int]
     ) -> "Prior":
-        """Compute the prior of known inverse depths, filled where their weight is less than 1."""
-        scenes, count, height, width = inverse.shape
-        size = (height, width)
+        """Compute the prior of depth maps; gaps are filled from their surroundings."""
+        scenes, count = views.images.shape[:2]
+        known = (depths > 0).to(depths)
+        stride = views.cameras.height // size[0]
+        fraction = F.avg_pool2d(known, stride)
+        inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride)
         images = F.interpolate(views.images.flatten(0, 1), size, mode="area")
         edges = color_edges(images.unflatten(0, (scenes, count))).to(inverse)
-        inverse = fill_unknown(inverse, weight, edges)
+        inverse = fill_unknown(inverse / fraction.clamp_min(1e-6), fraction, edges)
         others = other_views(count, scenes, inverse.device)
         projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
-        if (surfaces := views.surfaces(size)) is not None:
-            confidence = confidence * surfaces
+        surfaces = views.surfaces(size)
+        confidence = fraction if surfaces is None else fraction * surfaces
         votes = count_votes(inverse, confidence, others, projections)
         return cls.from_estimate(DepthEstimate(inverse, confidence, votes), views, size)
 
-    def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
-        """Return the log distance relative to the scene's median, and the confidence.
+    def gaussians(self, views: Views, spread: float) -> Gaussians:
+        """Place an isotropic Gaussian [B, V h w] at the surface point of each pixel of the grid.
 
-        Both are in about [-1, 1], independent of the scene's size.
+        Its standard deviation is `spread` pixels of the grid.
         """
-        ordered = self.distance.flatten(1).sort(dim=-1).values
-        median = ordered[:, (ordered.shape[1] - 1) // 2, None, None, None]
-        maps = ((self.distance / median).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
-        return torch.stack(
-            [F.interpolate(values, (height, width), mode="bilinear") for values in maps], dim=-1
+        size = tuple(self.distance.shape[-2:])
+        cameras = views.cameras.resized(*size)
+        origins, directions = cameras.rays()
+        distance = self.distance.to(directions)
+        colors = F.interpolate(views.images.flatten(0, 1), size, mode="area").movedim(1, -1)
+        gaussians = isotropic_gaussians(
+            (origins + distance[..., None] * directions).flatten(0, 3),
+            (distance / cameras.intrinsics[..., 0, 0, None, None] * spread).flatten(),
+            self.opacity.to(directions).flatten(),
+            colors.flatten(0, 2),
         )
+        return gaussians.map(lambda field: field.unflatten(0, (len(distance), -1)))
 
 
 def count_votes(
@@ -136,40 +140,3 @@ def _per_view_opacity(
 ) -> Float[Tensor, "B V h w"]:
     """Return the opacity at which a view and `other_views` more reach the opacity `total`."""
     return 1 - (1 - total) ** (1 / (1 + other_views))
-
-
-SPREAD = (0, 1, 2, 4)  # blocks around a point; each further radius takes a quarter of confidence
-
-
-class DepthPrior(nn.Module):
-    """The depth maps of the data, if there are any; gaps are filled from their surroundings."""
-
-    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        inverse, known_fraction = _block_means(views.depths, views, size)
-        return Prior.from_depths(inverse, known_fraction, known_fraction, views)
-
-
-class PointsPrior(nn.Module):
-    """The depths of the scene's sparse points, spread to their surroundings.
-
-    The data has points with `data.points=true`; without any, all depths are unknown.
-    """
-
-    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        inverse, known_fraction = _block_means(views.point_depths, views, size)
-        known = (known_fraction > 0).to(known_fraction)
-        spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
-        return Prior.from_depths(inverse, known, torch.stack(spread).mean(0), views)
-
-
-def _block_means(
-    depths: Float[Tensor, "B V H W"] | None, views: Views, size: tuple[int, int]
-) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
-    """Return the mean inverse depth of each block of pixels, and the fraction of known pixels."""
-    if depths is None:
-        depths = torch.zeros_like(views.images[:, :, 0])
-    known = (depths > 0).to(depths)
-    stride = depths.shape[-2] // size[0]
-    known_fraction = F.avg_pool2d(known, stride)
-    inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / known_fraction.clamp_min(1e-6)
-    return inverse, known_fraction

@@ -13,7 +13,7 @@ from asysplat.geometry.motion import rotations
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.isotropic import random_normal
+from asysplat.refinement.footprints import random_normal
 from asysplat.scene import Cameras, Views
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images

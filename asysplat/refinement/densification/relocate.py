@@ -11,7 +11,7 @@ from asysplat.kernels.dispatch import to_float64
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.isotropic import random_normal
+from asysplat.refinement.footprints import random_normal
 from asysplat.scene import Gaussians, Views
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale

@@ -7,10 +7,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.refinement.densification import Densifier
 from asysplat.refinement.fields import Fields
+from asysplat.refinement.footprints import random_permutation
 from asysplat.refinement.hull import is_outside
-from asysplat.refinement.isotropic import isotropic_gaussians, random_permutation
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 

@@ -20,8 +20,7 @@ IMAGE = ("set", "scene", "view")  # the columns that identify a row
 class Metrics(Callback):
     """Computes the protocol's metrics of each image, for loggers and a CSV.
 
-    `results` holds the means of every test set, the protocol's descriptions, and the fractions that
-    the network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
+    `results` holds the means of every test set and the protocol's descriptions.
     Rows of images are gathered, and not the sums of torchmetrics' classes, since processes may
     repeat an image to have as many batches as the others, and the CSV has each image.
     """
@@ -30,7 +29,6 @@ class Metrics(Callback):
         self.protocol, self.folder = protocol, Path(folder)
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.charted, self.rows = False, list[ImageRow]()
-        self.early_exit_rows: list[ImageRow] = []
         self.results: dict[str, float | str] = {}
 
     def setup(self, trainer: Trainer, module: SplattingModule, stage: str) -> None:
@@ -58,7 +56,7 @@ class Metrics(Callback):
         self.rows = []
 
     def on_test_epoch_start(self, *_: object) -> None:
-        self.rows, self.early_exit_rows = [], []
+        self.rows = []
 
     def on_validation_batch_end(
         self, trainer: Trainer, _: SplattingModule, outputs: Prediction, batch: Batch, *__: object
@@ -76,9 +74,6 @@ class Metrics(Callback):
     ) -> None:
         test_set = list(trainer.datamodule.tests)[set_index]
         self._add(test_set, batch, outputs, validation=False)
-        if module.net.early_exit_fractions:
-            row: ImageRow = {"set": test_set, "scene": batch["scene"][0], "view": 0}
-            self.early_exit_rows.append(row | module.net.early_exit_fractions)
 
     def on_validation_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
@@ -88,16 +83,12 @@ class Metrics(Callback):
         self.charted = True
 
     def on_test_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
-        rows, early_exit_rows = gather(trainer, self.rows), gather(trainer, self.early_exit_rows)
-        results = {}
+        rows, results = gather(trainer, self.rows), {}
         for test_set in trainer.datamodule.tests:
             of_set = [row for row in rows if row["set"] == test_set]
             for name, value in average(of_set, self.protocol.mean_over).items():
                 kind = "baseline" if "/" in name else "test"
                 results[f"{kind}/{test_set}/{name}"] = value
-            of_set = [row for row in early_exit_rows if row["set"] == test_set]
-            for name, fraction in average(of_set, "images").items():
-                results[f"early_exit/{test_set}/{name}"] = fraction
         module.log_dict(results)
         self.results |= results
         if trainer.is_global_zero:
