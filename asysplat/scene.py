@@ -332,7 +332,7 @@ class Views(TensorRecord):
         """Return views whose images are in [0, 1]."""
         if self.images.dtype != torch.uint8:
             return self
-        return replace(self, images=self.images.float() / 255)
+        return replace(self, images=torch.div(self.images, 255))  # without a copy in between
 
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.

@@ -1,5 +1,6 @@
 """Which photographs are blurred: far less sharp than those that show about the same."""
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,9 +16,13 @@ def find_blurred(images: Float[Tensor, "V 3 H W"], cameras: Cameras) -> Bool[Ten
 
     Sharpness is the root of the mean square of the Laplacian of the gray image.
     """
-    gray = F.pad(images.mean(1, keepdim=True), (1, 1, 1, 1), mode="replicate")
-    kernel = gray.new_tensor([[0, 1, 0], [1, -4, 1], [0, 1, 0]])[None, None]
-    sharpness = F.conv2d(gray, kernel).square().mean((1, 2, 3)).sqrt()
+    kernel = images.new_tensor([[0, 1, 0], [1, -4, 1], [0, 1, 0]])[None, None]
+    sharpness = torch.stack([_sharpness(image, kernel) for image in images])
     apart = cameras.distances(cameras)
     near = apart.topk(min(COMPARED, len(images)), largest=False).indices
     return sharpness < BLURRED * sharpness[near].median(-1).values
+
+
+def _sharpness(image: Float[Tensor, "3 H W"], kernel: Float[Tensor, "1 1 3 3"]) -> Tensor:
+    gray = F.pad(image.mean(0)[None, None], (1, 1, 1, 1), mode="replicate")
+    return F.conv2d(gray, kernel).square().mean().sqrt()

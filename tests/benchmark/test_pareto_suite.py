@@ -14,11 +14,13 @@ from benchmarks.pareto import BASE, average_scenes, find_scenes, plot, select_in
 SIDE = 32
 VARIANTS = {
     "feed_forward": {
-        "bf16": {"precision": "bf16"},
         "side_16": {"side": 16},
-        "side_24": {"side": 24},  # which the network cannot take
     },
-    "networks": {"8m": {"overrides": ["model.layers=1m", "width=0.125", "state_size=8"]}},
+    "networks": {
+        "8m": {"overrides": ["model.layers=1m", "width=0.125", "state_size=8"]},
+        "bf16": {"precision": "bf16"},
+        "side_24": {"side": 24},  # which networks cannot take
+    },
     "refined": {"no_densify": {"refinement": {"densify": "none"}}},
     "reconstruct": {
         "start": {"seconds": None, "steps": 0},
@@ -69,13 +71,13 @@ def test_rows_are_complete_and_errors_grow_with_what_is_left_out(make_pareto, ru
         assert (row["psnr"] is None) == (family == "networks")
         assert (row["error"] is None) == (name == BASE and family in ("refined", "reconstruct"))
     absent = results["not_measured"]
-    assert absent["fern"].endswith("is no folder") and "feed_forward, room, side_24" in absent
+    assert absent["fern"].endswith("is no folder") and "networks, room, side_24" in absent
 
     decibels = {key: row["error"]["decibels"] for key, row in rows.items() if row["error"]}
-    base, bf16, side = (decibels["feed_forward", name] for name in (BASE, "bf16", "side_16"))
-    assert base > 70 and base > bf16 > side > 10
+    assert decibels["feed_forward", BASE] > 60 > decibels["feed_forward", "side_16"] > 10
     # Other layers are compared with their own float64, not with the base's.
-    assert min(decibels["networks", BASE], decibels["networks", "8m"]) > 70
+    others = [decibels["networks", name] for name in (BASE, "8m")]
+    assert min(others) > 70 and min(others) > decibels["networks", "bf16"] > 30
 
     scene = select_inputs(find_scenes(["room"], tmp_path)[0]["room"](SIDE, 16, 4), 3, SIDE)
     with torch.no_grad():

@@ -15,7 +15,9 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
+from asysplat.errors import InputError
 from asysplat.refinement import BRIEF, DEFAULT, FEW, PAPER, PUBLISHED_3DGS, SCAFFOLD_GS
+from asysplat.runs.stages import check_stages
 from paper.tables import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +33,9 @@ CHOICES = {
 }
 CHOICES = sorted(CHOICES - PARTS)
 STAGES = ("stage1", "stage2", "stage3", "ablation")
+UNTRAINED = "model=plane_sweep"
 TRAINED = [choice for choice in CHOICES if choice.startswith(("model=", "experiment=t"))]
+TRAINED.remove(UNTRAINED)
 TRAINED += ["stage=stage3", "stage=ablation"]
 # Models that differ from another in the mix of their layers alone, and what takes long.
 MIX = r"model=(asysplat_\d[mt]\d?a?|asysplat_7m1[st]|longlrm_(18|24))$|experiment=three_stages"
@@ -50,7 +54,13 @@ def composed(composed):
 @pytest.mark.medium
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_choice_composes_and_builds_its_model(build, choice):
-    assert sum(p.numel() for p in build(choice, device="meta").parameters()) > 1e6
+    count = sum(p.numel() for p in build(choice, device="meta").parameters())
+    assert count == 0 if choice == UNTRAINED else count > 1e6
+
+
+def test_a_model_without_parameters_is_not_trained(composed):
+    with pytest.raises(InputError, match="nothing to train"):
+        check_stages([composed(UNTRAINED)])
 
 
 def test_hydra_and_the_code_read_the_same_refinements(composed):

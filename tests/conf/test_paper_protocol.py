@@ -106,10 +106,10 @@ COMMANDS = [
 @pytest.mark.medium
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_of_the_paper_compose_its_network(compose_train, command):
-    """Without a model: asysplat_4m4s, without a prior, with the head of the scale."""
+    """Without a model: asysplat_4m4s, with the head of the scale."""
     config = compose_train(*command.split(), *(PLACES if "data=" in command else ()))
     assert config.hydra.runtime.choices.model == "asysplat_4m4s"
-    assert config.model.layers == "4m4s" and config.model.prior is None
+    assert config.model.layers == "4m4s"
     large = "scale=gpu" in command or "scale=paper" in command
     head = config.model.head
     assert head._target_.endswith(".LongLRMHead" if large else ".ResidualHead")
