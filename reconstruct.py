@@ -65,11 +65,15 @@ from asysplat.refinement.exposure import even_exposures, find_exposures
 from asysplat.refinement.init import INITS, initial_gaussians, sweep
 from asysplat.refinement.trial import CLEAR_GAIN, TRIAL_FROM, TRIAL_VIEWS, trial_gain
 from asysplat.root import typed
-from asysplat.runs.machine import find_device
+from asysplat.runs.machine import find_device, free_gb
 from asysplat.scene import Gaussians, Views
 from asysplat.terminal import make_console
 
 RANGES = {"last_fit": Fraction, "exposure": Literal["auto", "given"]}
+RANGES["memory_gb"] = Positive | None
+PROGRAM_GB = 1.2  # of the process, without photographs and Gaussians
+BYTES_PER_GAUSSIAN = 1200  # with gradients, averages of the optimizer, and copies of some
+MARGIN_GB = 1.0  # that stays free
 
 
 @command("reconstruct")
@@ -93,6 +97,7 @@ def reconstruct(config: DictConfig) -> None:
     results = Results(Path(config.paths.run), config, per_view)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_error")
     options = {name: config[name] for name in (*names, "masks", "background")}
+    options["max_gb"] = photographs_gb(config, device)
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, make_console())
     photographs = open_photographs(config.path, **options)
@@ -163,6 +168,14 @@ def without_scene_files(config: DictConfig, given: set[str]) -> DictConfig:
     config = config.copy()
     config.output = []
     return config
+
+
+def photographs_gb(config: DictConfig, device: torch.device) -> float:
+    """Compute the memory that is left for photographs, in GB; it may be negative."""
+    memory = free_gb(device) - MARGIN_GB
+    if config.memory_gb is not None:
+        memory = config.memory_gb - PROGRAM_GB
+    return memory - (config.refinement.max_gaussians or 0) * BYTES_PER_GAUSSIAN / 1e9
 
 
 def describe(config: DictConfig, photographs: Photographs, limit: dict[str, float]) -> str:

@@ -332,7 +332,7 @@ class Views(TensorRecord):
         """Return views whose images are in [0, 1]."""
         if self.images.dtype != torch.uint8:
             return self
-        return replace(self, images=torch.div(self.images, 255))  # without a copy in between
+        return replace(self, images=self.images.float().div_(255))  # one copy
 
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.
@@ -362,9 +362,9 @@ class Views(TensorRecord):
 
     def mean_color(self) -> Float[Tensor, "*batch 3"]:
         """Compute the mean color of all pixels that are masked in; gray if there are none."""
-        colors = self.images.movedim(-3, -1)
         if self.masks is None:
-            return colors.flatten(-4, -2).mean(-2)
+            return self.images.mean((-4, -2, -1))
+        colors = self.images.movedim(-3, -1)
         weights = self.masks[..., None].to(colors)
         total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
         return (total / count).nan_to_num(0.5)
@@ -415,7 +415,8 @@ class Views(TensorRecord):
             InputError: as for `Cameras.validate`; also images outside [0, 1] or depths below 0.
         """
         self.cameras.validate(f"{name}.cameras")
-        if self.images.dtype != torch.uint8:
+        floats = self.images.dtype != torch.uint8 and self.images.numel() > 0
+        if floats and not all(0 <= end.item() <= 1 for end in self.images.aminmax()):
             _check_finite(f"{name}.images", self.images, 3)
             _check_all(
                 f"{name}.images",

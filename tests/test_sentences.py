@@ -124,11 +124,15 @@ def test_a_height_above_the_photographs_is_lowered_to_theirs(scene):
     assert "height=3000: the photographs have 24 pixels, which are used." in said
 
 
-def test_as_many_photographs_as_memory_holds(scene, monkeypatch):
-    options = {"height": 24, "views": None, "held_out_every": None}
+def test_as_many_photographs_as_memory_holds(scene):
+    said, one = [], 24 * 32 * photographs.BYTES_PER_PIXEL / 1e9
+    options = {"height": 24, "views": None, "held_out_every": None, "say": said.append}
     assert asysplat.open_photographs(scene, **options).inputs.num_views == 4
-    monkeypatch.setattr(photographs, "MAX_BYTES", 3 * 24 * 32 * photographs.BYTES_PER_PIXEL)
-    assert asysplat.open_photographs(scene, **options).inputs.num_views == 3
+    some = asysplat.open_photographs(scene, **options, max_gb=3.5 * one)
+    assert some.inputs.num_views == 3
+    assert "3 of 4 photographs are used: memory_gb= holds no more." in said
+    with pytest.raises(InputError, match=r"^memory_gb leaves .* of which two of 24x32 pixels take"):
+        asysplat.open_photographs(scene, **options, max_gb=1.5 * one)
 
 
 MISTAKES = {

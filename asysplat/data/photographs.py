@@ -1,5 +1,6 @@
 """The photographs of one scene, as input and held-out views."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +24,7 @@ from asysplat.scene import Cameras, Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: bad images are decoded at it, before the size is known
-MAX_BYTES = 2 * 10**9  # size of all input views; a refinement takes about as much again
-BYTES_PER_PIXEL = 15  # float32 RGB, and the same at half the size
+BYTES_PER_PIXEL = 20  # of a reconstruction: float32 RGB, the same at half the size, copies of some
 RANGES = {
     "height": Count,
     "width": Count | None,
@@ -85,6 +85,7 @@ def open_photographs(
     masks: MasksOf = "auto",
     background: Background = "auto",
     cameras: CameraOptions = GIVEN,
+    max_gb: float | int = math.inf,
     say: Callable[[str], None] = print,
 ) -> Photographs:
     """Open photographs, select some evenly, and bring them into the network's frame.
@@ -93,18 +94,19 @@ def open_photographs(
         path, layout, on_error: see `open_scene`.
         height, width: size of the views in pixels; width None keeps the first photograph's aspect
             ratio.
-        views, max_held_out: number of input and of held-out views, at most; views None: as many
-            input views as MAX_BYTES hold.
+        views, max_held_out: number of input and of held-out views, at most; views None: all.
         cameras: choice of given, refined or found cameras.
         held_out_every: hold out every n-th photograph, from the first on, or those that the data
             set holds out, if it names some; None: none.
         masks: whether masks are of an "object", or of what to "ignore"; "auto": see `with_masks`;
             "find": without masks of an object, a network finds it, see `load_object_finder`.
         background: color behind an object; see `with_background`.
-        say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
+        max_gb: memory that the input views may take in a reconstruction; more are left out.
+        say: takes warnings: a smaller height than asked for, views that are left out, or cameras
+            that do not fit the images.
 
     Raises:
-        InputError: fewer than two input views; see `open_scene`.
+        InputError: fewer than two input views, or memory for no more; see `open_scene`.
 
     Example:
         >>> from asysplat import open_photographs
@@ -133,8 +135,6 @@ def open_photographs(
             say(f"height={height}: the photographs have {lens.height} pixels, which are used.")
             height = lens.height
         width = max(1, round(height * lens.width / lens.height))
-    if views is None:
-        views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
     indices, published = range(len(scene.images)), scene.held_out
     held_out = published or indices[::held_out_every] if held_out_every else []
     rest = sorted(set(indices) - set(held_out) - set(published))
@@ -143,7 +143,17 @@ def open_photographs(
             f"{path} has {len(scene.images)} photographs, of which held_out_every={held_out_every} "
             f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
         )
-    inputs = evenly_spaced(rest, min(views, len(rest)))
+    count, one_gb = min(views or len(rest), len(rest)), height * width * BYTES_PER_PIXEL / 1e9
+    if max_gb < 2 * one_gb:
+        raise InputError(
+            f"memory_gb leaves {max(0, max_gb):.2g} GB for photographs, of which two of "
+            f"{height}x{width} pixels take {2 * one_gb:.2g}: give more, or lower height= or "
+            "refinement.max_gaussians=."
+        )
+    if count * one_gb > max_gb:
+        say(f"{int(max_gb / one_gb)} of {count} photographs are used: memory_gb= holds no more.")
+        count = int(max_gb / one_gb)
+    inputs = evenly_spaced(rest, count)
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
         scene = _with_chosen_cameras(scene, sorted((*inputs, *held_out)), cameras, say)

@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 from functools import cache
 
+import psutil
 import torch
 
 from asysplat.errors import InputError
@@ -22,6 +23,13 @@ def find_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda is not there: torch finds no GPU; take device=cpu.")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def free_gb(device: torch.device) -> float:
+    """Return the memory of a device that is free, in GB."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0] / 1e9
+    return psutil.virtual_memory().available / 1e9
 
 
 def find_accelerator(name: str) -> str:

@@ -17,8 +17,9 @@ from asysplat.training import SplattingLoss, SplattingModule
 from asysplat.training.optimizers import cosine
 
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
+UNTRAINED = ("plane_sweep",)
 FOLDER = Path(__file__).parents[2] / "conf" / "model"
-MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS)
+MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS + UNTRAINED)
 
 
 def make_module(net, background=(0.5, 0.5, 0.5), warmup_steps=1, total_steps=2, **options):

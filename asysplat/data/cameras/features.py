@@ -12,6 +12,7 @@ from rich.progress import Progress
 ALL_PAIRS = 80  # greatest number of photographs of which all pairs are matched
 FOLLOWING = 10  # next photographs that each is matched with, besides those 16, 32, ... further on
 ANCHORS = 40  # evenly spread photographs that are all matched: a sequence may return to a place
+PARTNERS = 8  # others that each photograph is matched with in a second attempt
 AROUND = 40  # photographs before and after one without a camera that it is then matched with
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
@@ -41,10 +42,12 @@ def match_photographs(
     effort: Effort,
     progress: Progress,
     cameras: Mapping[AnyLens, pycolmap.Camera] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> Path:
     """Write a database of features and verified matches of work/images; return its path.
 
     Args:
+        pairs: those that are matched; None: all, or of a long sequence those that are near.
         work: its masks/ may have NAME.png, 0 where features are not wanted.
         lenses: by photograph, in the order of the sequence; those of the same lens have one camera.
         cameras: camera of each lens, where lenses are known; else a focal length is guessed.
@@ -76,8 +79,28 @@ def match_photographs(
             extraction_options=extraction,
         )
         progress.advance(task, len(chunk))
-    _match(database, _pairs(list(lenses)), effort, progress)
+    _match(database, _pairs(list(lenses)) if pairs is None else pairs, effort, progress)
     return database
+
+
+def likely_pairs(database: Path, names: Sequence[str]) -> list[tuple[str, str]]:
+    """List pairs of photographs: of each those with its PARTNERS that match it most.
+
+    Matches count before they are verified; without any, photographs that follow each other do.
+    """
+    order = {name: number for number, name in enumerate(names)}
+    matches = {}
+    with pycolmap.Database.open(database) as stored:
+        numbers = {image.image_id: order[image.name] for image in stored.read_all_images()}
+        for pair, count in zip(*stored.read_num_matches(), strict=True):
+            first, second = (numbers[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            matches[first, second] = matches[second, first] = count
+    chosen = set()
+    for one in range(len(names)):
+        others = [other for other in range(len(names)) if other != one]
+        others.sort(key=lambda x: (-matches.get((one, x), 0), abs(one - x)))
+        chosen |= {(min(one, other), max(one, other)) for other in others[:PARTNERS]}
+    return [(names[i], names[j]) for i, j in sorted(chosen)]
 
 
 def match_further(

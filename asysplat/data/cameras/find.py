@@ -21,6 +21,7 @@ from asysplat.data.cameras.features import (
     SEED,
     USUAL,
     Effort,
+    likely_pairs,
     match_further,
     match_photographs,
 )
@@ -70,7 +71,7 @@ def find_cameras(
     frames of a video; its masks/ are theirs, and what they leave out is not matched; its sparse/0
     has the cameras and points. Where fewer than 9 of 10 cameras are found, the photographs of a
     sequence that are left are matched with more of the others; if there still are, a second attempt
-    with weaker features follows, and the better one is returned.
+    with weaker features of the pairs that matched most follows, and the better one is returned.
 
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
@@ -99,11 +100,14 @@ def find_cameras(
             mask = masks.get(file)
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
-        model = None
+        model = pairs = None
         for attempt in ATTEMPTS:
-            model = max(model, _reconstruct(work, kinds, attempt, progress), key=_registered)
+            database = match_photographs(work, kinds, attempt.effort, progress, pairs=pairs)
+            grown = _reconstruct(work, kinds, database, attempt, progress)
+            model = max(model, grown, key=_registered)
             if _registered(model) >= ENOUGH * len(kinds):
                 break
+            pairs = likely_pairs(database, list(kinds))
         if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
@@ -154,13 +158,16 @@ def _registered(model: pycolmap.Reconstruction | None) -> int:
 
 
 def _reconstruct(
-    work: Path, lenses: dict[str, tuple], attempt: Attempt, progress: Progress
+    work: Path,
+    lenses: dict[str, tuple],
+    database: Path,
+    attempt: Attempt,
+    progress: Progress,
 ) -> pycolmap.Reconstruction | None:
     """Return the largest model that can be built; images of the same lens have one camera.
 
     Of a sequence, those that it left open are matched further, and it goes on with them.
     """
-    database = match_photographs(work, lenses, attempt.effort, progress)
     model = _map(work, lenses, database, attempt, progress)
     if model is None or _registered(model) >= ENOUGH * len(lenses):
         return model

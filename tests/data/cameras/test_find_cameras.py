@@ -182,6 +182,25 @@ def test_what_the_pairs_of_a_sequence_leave_open_is_matched_further(views, tmp_p
     assert len(read_poses(found / "sparse" / "0")) == COUNT - 3
 
 
+@pytest.mark.medium
+def test_a_second_attempt_matches_what_matched_most(views, tmp_path, monkeypatch):
+    save_first(views, 8, tmp_path / "scene")
+    asked, match = [], find.match_photographs
+
+    def recorded(*arguments, pairs):
+        asked.append(pairs)
+        return match(*arguments, pairs=pairs)
+
+    monkeypatch.setattr(find, "match_photographs", recorded)
+    monkeypatch.setattr(find, "ENOUGH", 1.1)
+    monkeypatch.setattr(features, "PARTNERS", 2)
+    found = find_cameras(tmp_path / "scene", tmp_path / "logs")
+    assert len(read_poses(found / "sparse" / "0")) == 8
+    first, second = asked
+    apart = [abs(int(one[:-4]) - int(other[:-4])) for one, other in second]
+    assert first is None and 8 <= len(apart) <= 16 and max(apart) <= 3
+
+
 def test_names_that_differ_by_spaces(views, tmp_path):
     for index, name in enumerate(("a 1.png", "a_1.png", "a  1.png", "b.png")):
         save(views.images[index], tmp_path / "scene" / name)
