@@ -64,7 +64,7 @@ def test_the_source_distribution_builds_the_same_wheel(repository, wheel, tmp_pa
 
 
 def test_every_configuration_is_in_the_wheel(repository, wheel):
-    files = [*repository.glob("conf/**/*.yaml"), *repository.glob("checkpoints/*")]
+    files = repository.glob("conf/**/*.yaml")
     names = {f"asysplat/installed/{path.relative_to(repository)}" for path in files}
     assert names <= contents(wheel).keys()
 
