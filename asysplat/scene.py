@@ -362,9 +362,9 @@ class Views(TensorRecord):
 
     def mean_color(self) -> Float[Tensor, "*batch 3"]:
         """Compute the mean color of all pixels that are masked in; gray if there are none."""
-        if self.masks is None:
-            return self.images.mean((-4, -2, -1))
         colors = self.images.movedim(-3, -1)
+        if self.masks is None:
+            return colors.flatten(-4, -2).mean(-2)
         weights = self.masks[..., None].to(colors)
         total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
         return (total / count).nan_to_num(0.5)
