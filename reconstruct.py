@@ -69,8 +69,11 @@ from asysplat.runs.machine import find_device, free_gb
 from asysplat.scene import Gaussians, Views
 from asysplat.terminal import make_console
 
-RANGES = {"last_fit": Fraction, "exposure": Literal["auto", "given"]}
-RANGES["memory_gb"] = Positive | None
+RANGES = {
+    "last_fit": Fraction,
+    "exposure": Literal["auto", "given"],
+    "memory_gb": Positive | None,
+}
 PROGRAM_GB = 1.2  # of the process, without photographs and Gaussians
 BYTES_PER_GAUSSIAN = 1200  # with gradients, averages of the optimizer, and copies of some
 MARGIN_GB = 1.0  # that stays free
@@ -90,6 +93,8 @@ def reconstruct(config: DictConfig) -> None:
     limit = read_limit(config)
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
+    if config.init == "network" and config.checkpoint is None:
+        raise InputError("init=network: name a trained one, checkpoint=....ckpt.")
     settings = instantiate(config.refinement)
     per_view = isinstance(settings, ScaffoldSettings)
     if per_view:
@@ -268,8 +273,6 @@ def initialize(
     """Build the Gaussians to refine, in the network's frame, on the photographs' device."""
     init, network, device = config.init, None, photographs.inputs.images.device
     if init == "network":
-        if config.checkpoint is None:
-            raise InputError("init=network: name a trained one, checkpoint=....ckpt.")
         network = load(config.checkpoint).to(device)
     if init not in INITS and Path(str(init)).suffix:
         gaussians = read_gaussians(init, photographs.origin).to(device)

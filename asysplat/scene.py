@@ -17,7 +17,6 @@ from torch import Tensor
 from asysplat.errors import InputError
 
 ORTHONORMAL_TOLERANCE = 1e-3
-TINY = 1e-6  # depths and inverse depths above which nothing underflows
 MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
 MAPS = ("depths", "masks", "alphas", "disparities")  # optional fields of `Views`
 UNKNOWN = {"masks": True, "alphas": 1.0}  # where a field is unknown; depths are 0

@@ -113,7 +113,7 @@ class FeedForward:
     views: int  # input views
     side: int  # side of the input views, in pixels
     checkpoint: str | None = "shipped"  # see `load`; None: untrained
-    overrides: Sequence[str] = ()  # of train.py, see `load`
+    overrides: Sequence[str] = ()  # options of train.py, see `load`
     precision: str = "fp32"  # fp32; bf16: autocast of a network; fp64: everything in float64
     min_opacity: float = 0.0  # Gaussians of a lower opacity are dropped
     cell: float | None = None  # side in pixels of the cells in which Gaussians are merged

@@ -47,10 +47,10 @@ def match_photographs(
     """Write a database of features and verified matches of work/images; return its path.
 
     Args:
-        pairs: those that are matched; None: all, or of a long sequence those that are near.
         work: its masks/ may have NAME.png, 0 where features are not wanted.
         lenses: by photograph, in the order of the sequence; those of the same lens have one camera.
         cameras: camera of each lens, where lenses are known; else a focal length is guessed.
+        pairs: names of two to match; None: of all, or of those that are near in a long sequence.
     """
     database = work / f"{effort.features}.db"
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=effort.max_side)

@@ -100,14 +100,14 @@ def find_cameras(
             mask = masks.get(file)
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
-        model = pairs = None
+        model = database = None
         for attempt in ATTEMPTS:
+            pairs = None if database is None else likely_pairs(database, list(kinds))
             database = match_photographs(work, kinds, attempt.effort, progress, pairs=pairs)
             grown = _reconstruct(work, kinds, database, attempt, progress)
             model = max(model, grown, key=_registered)
             if _registered(model) >= ENOUGH * len(kinds):
                 break
-            pairs = likely_pairs(database, list(kinds))
         if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
