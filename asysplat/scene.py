@@ -7,6 +7,7 @@ orthonormal) and is called once, where data enters.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from operator import itemgetter
 from typing import TypeVar
 
 import torch
@@ -237,7 +238,8 @@ class Views(TensorRecord):
 
     Args:
         cameras: V cameras.
-        images: [..., V, 3, H, W] RGB in [0, 1], or as files store it: uint8 in 0..255.
+        images: [..., V, 3, H, W] RGB in [0, 1], or as files store it: uint8 in 0..255, a fourth of
+            the memory.
         depths: [..., V, H, W] along the camera's z axis, in scene units; 0 if unknown.
         masks: [..., V, H, W], True where a pixel counts.
         alphas: [..., V, H, W] opacity of the photographed object in [0, 1]: 0 where a pixel shows
@@ -289,7 +291,7 @@ class Views(TensorRecord):
         return replace(self, cameras=self.cameras.select(index), images=images, **selected)
 
     def join(self, others: "Views") -> "Views":
-        """Return these views and then others of the same size.
+        """Return these views and then others of the same size, their images stored as these are.
 
         A field that only one part has is unknown of the other: masked in, opaque, depth 0.
         """
@@ -312,7 +314,8 @@ class Views(TensorRecord):
                     ],
                     dim=-3,
                 )
-        images = torch.cat([part.images for part in parts], dim=-4)
+        stored = encode(decode(others.images), self.images.dtype)
+        images = torch.cat((self.images, stored), dim=-4)
         return Views(self.cameras.join(others.cameras), images, **maps)
 
     @property
@@ -325,13 +328,25 @@ class Views(TensorRecord):
     def nearest_images(self, cameras: Cameras) -> Tensor:
         """Return [..., W, 3, H, W], for each of the cameras the image of the nearest view."""
         nearest = cameras.distances(self.cameras).argmin(-1)
-        return self.images.take_along_dim(nearest[..., None, None, None], dim=-4)
+        return decode(self.images.take_along_dim(nearest[..., None, None, None], dim=-4))
+
+    def one(self, view: int) -> "Views":
+        """Return one of [V] views, [1], decoded; a slice copies nothing and waits for no GPU."""
+        return self.map(itemgetter(slice(view, view + 1))).decoded()
 
     def decoded(self) -> "Views":
         """Return views whose images are in [0, 1]."""
-        if self.images.dtype != torch.uint8:
-            return self
-        return replace(self, images=self.images.float().div_(255))  # one copy
+        return replace(self, images=decode(self.images))
+
+    def with_images(self, change: Callable[[int, "Views"], Tensor]) -> "Views":
+        """Return [V] views with other images, stored as before.
+
+        `change` computes that of a view, [1, 3, H, W] in [0, 1], from its index and the view, [1].
+        """
+        images = torch.empty_like(self.images)
+        for view in range(self.num_views):
+            images[view] = encode(change(view, self.one(view)), images.dtype)[0]
+        return replace(self, images=images)
 
     def resized(self, height: int, width: int) -> "Views":
         """Return views of another size, with the same field of view.
@@ -345,7 +360,9 @@ class Views(TensorRecord):
         )
 
         methods: dict[str, Callable[[Tensor], Tensor]] = {
-            "images": area,
+            "images": lambda images: torch.cat(
+                [encode(area(decode(part)), images.dtype) for part in images.split(3)]
+            ),
             "alphas": area,
             "masks": lambda masks: whole_pixels(masks, size),
             "depths": nearest,
@@ -361,12 +378,22 @@ class Views(TensorRecord):
 
     def mean_color(self) -> Float[Tensor, "*batch 3"]:
         """Compute the mean color of all pixels that are masked in; gray if there are none."""
-        colors = self.images.movedim(-3, -1)
-        if self.masks is None:
-            return colors.flatten(-4, -2).mean(-2)
-        weights = self.masks[..., None].to(colors)
-        total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
+        if self.images.dtype == torch.uint8:  # [V], one by one
+            sums = [self.one(view)._color_sums() for view in range(self.num_views)]
+            total, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+        elif self.masks is None:
+            return self.images.movedim(-3, -1).flatten(-4, -2).mean(-2)
+        else:
+            total, count = self._color_sums()
         return (total / count).nan_to_num(0.5)
+
+    def _color_sums(self) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 1"]]:
+        colors = self.images.movedim(-3, -1)
+        weights = torch.ones_like(colors[..., :1])
+        if self.masks is not None:
+            weights = self.masks[..., None].to(colors)
+        total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
+        return total, count
 
     def color_behind(self, default: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Compute the mean color of the pixels that show the background alone; else `default`."""
@@ -382,7 +409,7 @@ class Views(TensorRecord):
         """Copy the photographs into masked pixels, where they add no error or gradient."""
         if self.masks is None:
             return rendered
-        return torch.where(self.masks[..., None, :, :], rendered, self.images)
+        return torch.where(self.masks[..., None, :, :], rendered, decode(self.images))
 
     def without(self, pixels: Bool[Tensor, "*batch V H W"]) -> "Views":
         """Mask out pixels, too."""
@@ -393,6 +420,8 @@ class Views(TensorRecord):
         """Change the color, RGB, that transparent pixels show; opaque ones stay."""
         if self.alphas is None:
             return self
+        if self.images.dtype == torch.uint8:
+            return self.with_images(lambda _, view: view.over(before, color).images)
         change = (1 - self.alphas)[..., None, :, :] * (color - before)[:, None, None]
         return replace(self, images=(self.images + change).clamp(0, 1))
 
@@ -434,6 +463,16 @@ class Views(TensorRecord):
                     f"has negative values: give {unit}, 0 if unknown",
                 )
         return self
+
+
+def decode(images: Tensor) -> Tensor:
+    """Return images, uint8 or decoded ones, in [0, 1]."""
+    return images.float().div_(255) if images.dtype == torch.uint8 else images
+
+
+def encode(images: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return images in [0, 1] as they are stored: rounded for uint8, else as they are."""
+    return (images * 255).round_().byte() if dtype == torch.uint8 else images
 
 
 def whole_pixels(masks: Bool[Tensor, "B V H W"], size: tuple[int, int]) -> Bool[Tensor, "B V h w"]:

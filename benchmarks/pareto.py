@@ -143,7 +143,7 @@ class FeedForward:
         @torch.no_grad()
         def run(scene: Photographs) -> RenderedViews:
             scene = select_inputs(scene, self.views, self.side)
-            inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
+            inputs, targets = scene.inputs.decoded().to(dtype), scene.held_out.to(dtype)
             with torch.autocast(device.type, torch.bfloat16, enabled=half):
                 gaussians = net(inputs)
             gaussians = gaussians.to(dtype)

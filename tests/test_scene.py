@@ -4,13 +4,14 @@ import re
 import subprocess
 import sys
 import textwrap
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
 from asysplat import Cameras, Gaussians, Views
 from asysplat.errors import InputError
+from asysplat.scene import encode
 
 
 def cameras(views=2, height=4, width=6):
@@ -87,6 +88,32 @@ def test_views_of_another_size_keep_every_field():
         alone = views.map(lambda values: values[batch]).resized(2, 3)  # noqa: B023
         assert torch.equal(alone.images, half.images[batch])
         assert torch.equal(alone.masks, half.masks[batch])
+
+
+def test_stored_views_are_decoded_ones_in_a_fourth_of_the_memory():
+    """Whatever is computed of views does not depend on how their images are stored."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(256, (5, 3, 6, 8), generator=generator, dtype=torch.uint8)
+    masks, alphas = torch.rand(2, 5, 6, 8, generator=generator)
+    stored = Views(cameras(5, 6, 8), images, masks=masks > 0.3, alphas=(alphas - 0.2).clamp(0, 1))
+    decoded = stored.decoded()
+    assert torch.equal(encode(decoded.images, torch.uint8), images)
+    assert torch.equal(stored.one(2).images, decoded.images[2:3])
+    assert torch.equal(stored.masked(decoded.images), decoded.images)
+    for each in (stored, replace(stored, masks=None)):
+        torch.testing.assert_close(each.mean_color(), each.decoded().mean_color())
+    nearest = stored.nearest_images(stored.cameras)
+    assert torch.equal(nearest, decoded.nearest_images(stored.cameras))
+    half_step = {"atol": 0.501 / 255, "rtol": 0.0}
+    white, green = torch.ones(3), torch.tensor([0.0, 1.0, 0.0])
+    for of in (lambda views: views.resized(3, 4), lambda views: views.over(white, green)):
+        changed, expected = of(stored), of(decoded)
+        assert changed.images.dtype == torch.uint8
+        torch.testing.assert_close(changed.decoded().images, expected.images, **half_step)
+    for first, second in ((stored, decoded), (decoded, stored)):
+        joined = first.join(second)
+        assert joined.images.dtype == first.images.dtype
+        assert torch.equal(joined.decoded().images, torch.cat(2 * [decoded.images]))
 
 
 def test_a_field_that_one_scene_lacks_is_dropped_from_the_batch():

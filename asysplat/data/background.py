@@ -10,6 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.scene import decode
 
 RING = 0.02  # width of the ring of border pixels, over the shorter side
 MIN_BORDER = 0.9  # fraction of a border that shows the background
@@ -22,7 +23,7 @@ Background = str | Sequence[float | int]  # auto, mean, a name in COLORS, or RGB
 
 
 def find_background(
-    images: Float[Tensor, "V 3 H W"],
+    images: Float[Tensor, "V 3 H W"] | UInt8[Tensor, "V 3 H W"],
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "V H W"]] | None:
     """Find the color around an object that lies within all photographs; None if there is none.
 
@@ -36,7 +37,7 @@ def find_background(
     ring = max(1, round(RING * min(height, width)))
     border = torch.ones(height, width, dtype=torch.bool)
     border[ring : height - ring, ring : width - ring] = False
-    borders = images[..., border].movedim(1, -1)  # [V, P, 3]
+    borders = decode(images[..., border]).movedim(1, -1)  # [V, P, 3]
     colors = borders.median(1).values
     color = colors.median(0).values
     deviations = (borders - colors[:, None]).abs().amax(-1)
@@ -45,9 +46,11 @@ def find_background(
     uniform &= (colors - color).abs().amax(-1) < MAX_DIFFERENCE
     if tolerance > MAX_TOLERANCE or uniform.float().mean() < MIN_VIEWS:
         return None
-    near = (images - colors[:, :, None, None]).abs().amax(1) < tolerance
-    alphas = np.stack([~_outer(view) for view in near.numpy().astype(np.uint8)])
-    return color, torch.from_numpy(alphas).to(images)
+    alphas = []
+    for image, own in zip(images, colors, strict=True):
+        near = (decode(image) - own[:, None, None]).abs().amax(0) < tolerance
+        alphas.append(~_outer(near.numpy().astype(np.uint8)))
+    return color, torch.from_numpy(np.stack(alphas)).to(borders)
 
 
 def _outer(near: UInt8[ndarray, "H W"]) -> Bool[ndarray, "H W"]:

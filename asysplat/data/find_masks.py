@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.scene import Views
+from asysplat.scene import Views, decode
 
 SIZE = (320, 320)  # pixels of the network's photographs and maps
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, on which it was trained
@@ -48,7 +48,8 @@ def load_object_finder() -> Callable[[Views], Views]:
         return (255 * alpha).round() / 255  # as files have it: what is nearly empty is empty
 
     def find_object(views: Views) -> Views:
-        alphas = torch.stack([find_alpha(image) for image in views.images])
-        return replace(views, images=1 - alphas[:, None] * (1 - views.images), alphas=alphas)
+        alphas = torch.stack([find_alpha(decode(image)) for image in views.images])
+        white = views.with_images(lambda view, one: 1 - alphas[view] * (1 - one.images))
+        return replace(white, alphas=alphas)
 
     return find_object

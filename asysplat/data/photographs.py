@@ -24,7 +24,7 @@ from asysplat.scene import Cameras, Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: bad images are decoded at it, before the size is known
-BYTES_PER_PIXEL = 20  # of a reconstruction: float32 RGB, the same at half the size, copies of some
+BYTES_PER_PIXEL = 8  # of a reconstruction: RGB, the same at half the size, maps, copies of some
 RANGES = {
     "height": Count,
     "width": Count | None,
@@ -41,8 +41,8 @@ class Photographs:
     """Views of one scene, and its sparse points if any, in the network's frame."""
 
     name: str  # name of the scene
-    inputs: Views
-    held_out: Views | None
+    inputs: Views  # images as files store them, uint8
+    held_out: Views | None  # images in [0, 1]
     input_files: list[str]
     held_out_files: list[str]
     normalization: Normalization  # from the world of the files to the network's frame
@@ -175,7 +175,8 @@ def load_photographs(
     `held_out` may be empty; the other options are those of `open_photographs`.
     """
     sequence = FileSequence(scene, SceneOptions(height, width))
-    both = [sequence.views(each).validate(scene.name) for each in (inputs, held_out or inputs[:1])]
+    chosen = inputs, held_out or inputs[:1]
+    both = [sequence.stored(each).validate(scene.name) for each in chosen]
     if find_object is not None and not _transparent_share(both[0]):
         both = [find_object(views) for views in both]
     input_views, targets, normalization = normalize(*both)
@@ -184,7 +185,7 @@ def load_photographs(
     return Photographs(
         name=scene.name,
         inputs=input_views,
-        held_out=targets if held_out else None,
+        held_out=targets.decoded() if held_out else None,
         input_files=[files[index] for index in inputs],
         held_out_files=[files[index] for index in held_out],
         normalization=normalization,

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.scene import Cameras, Views
+from asysplat.scene import Cameras, Views, decode
 
 STEPS_PER_UNIT = 1000  # stored depths of one scene unit
 MAX_STEP = 2**16 - 1  # largest depth in a 16-bit image
@@ -39,7 +39,7 @@ def write_transforms(views: Views, folder: Path) -> None:
         (folder / "depth").mkdir(exist_ok=True)
         content["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
     for index, (name, frame) in enumerate(zip(names, content["frames"], strict=True)):
-        write_image(views.images[index], folder / "images" / name)
+        write_image(decode(views.images[index]), folder / "images" / name)
         if views.depths is not None:
             frame["depth_file_path"] = f"depth/{name}"
             steps = (views.depths[index].double() * STEPS_PER_UNIT).round().numpy()

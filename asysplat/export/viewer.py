@@ -38,7 +38,7 @@ from asysplat.export.gaussians import camera_before, cameras_beside, read_gaussi
 from asysplat.export.page import BLACK
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians, Views, inverse_depths
+from asysplat.scene import Cameras, Gaussians, Views, decode, inverse_depths
 
 if TYPE_CHECKING:
     import viser  # an optional dependency
@@ -184,7 +184,7 @@ class Viewer:
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
-                image=_bytes(images[view]) if images[view, 0].numel() > 1 else None,
+                image=_bytes(decode(images[view])) if images[view, 0].numel() > 1 else None,
                 wxyz=viewer_cameras.quaternion(self._cameras, view),
                 position=self._cameras.centers[view].numpy(),
             )

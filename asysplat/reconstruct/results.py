@@ -4,7 +4,8 @@ import json
 import os
 import tempfile
 import webbrowser
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -179,16 +180,28 @@ class Results:
         results |= self._protocol.notes(self._lpips)
         photographs, rows = self._photographs, []
         inputs, held_out = photographs.inputs, photographs.held_out
-        sets = {"inputs": (inputs, photographs.input_files)}
-        if held_out is not None:
-            sets["held_out"] = (held_out, photographs.held_out_files)
-        seen_from = None
-        for name, (views, files) in sets.items():
-            numbers, depths = self._measure(scene, views, self._exposures[name], seen_from)
-            seen_from = depths, views.cameras  # inputs come first
-            results |= _means(name, numbers)
-            labels = ({"set": name, "file": file} for file in files)
-            rows += [label | row for label, row in zip(labels, numbers, strict=True)]
+        numbers: dict[str, list[dict[str, float]]] = {"inputs": []}
+
+        def input_depths() -> Iterator[Float[Tensor, "h w"]]:
+            for row, drawn in self._measure(scene, inputs, self._exposures["inputs"]):
+                numbers["inputs"].append(row)
+                yield _depth(drawn)[0]
+
+        if held_out is None:
+            deque(input_depths(), maxlen=0)
+        else:
+            measured = [*self._measure(scene, held_out, self._exposures["held_out"])]
+            depth = torch.cat([_depth(drawn) for _, drawn in measured])
+            shown = seen_by_inputs(depth, held_out.cameras, input_depths(), inputs.cameras)
+            numbers["held_out"] = [
+                row | self._of_seen(drawn.image, held_out.one(view), shown[[view]])
+                for view, (row, drawn) in enumerate(measured)
+            ]
+        files = {"inputs": photographs.input_files, "held_out": photographs.held_out_files}
+        for name, of_views in numbers.items():
+            results |= _means(name, of_views)
+            labels = ({"set": name, "file": file} for file in files[name])
+            rows += [label | row for label, row in zip(labels, of_views, strict=True)]
         if held_out is not None:
             baselines = self._protocol.measure_baselines(inputs, held_out, self._lpips)
             for name, numbers in baselines.items():
@@ -203,21 +216,16 @@ class Results:
         scene: Gaussians | AnchorScene,
         views: Views,
         exposures: Float[Tensor, "V 3"] | None,
-        seen_from: tuple[Float[Tensor, "W h w"], Cameras] | None,
-    ) -> tuple[list[dict[str, float]], Float[Tensor, "V h w"]]:
-        """Compute the metrics and depths of [V] views, rendered one by one to save memory.
+    ) -> Iterator[tuple[dict[str, float], Rendering]]:
+        """Yield the metrics and the rendering of each of [V] views, which are not kept.
 
-        Beside the metrics are the PSNR with a gain and an offset fitted to each image and, given
-        the depths and cameras of other views, that of the pixels that these see, and their share.
+        Beside the metrics is the PSNR with a gain and an offset fitted to each image.
         """
-        rows, depths = [], []
-        of_pixels = replace(self._protocol, psnr_over="masks")
         for view in range(views.num_views):
-            target = views.select([view])
+            target = views.one(view)
             seen = scene if isinstance(scene, Gaussians) else scene.decode(target.cameras).gaussians
             draw = partial(render, seen, target.cameras, self._background, masks=target.masks)
             drawn = draw()
-            assert drawn.depth is not None
             median = None if target.depths is None else draw(depth="median").depth
             image = drawn.image if exposures is None else expose(drawn.image, exposures[[view]])
             (row,) = self._protocol.measure_views(
@@ -225,14 +233,16 @@ class Results:
             )
             fitted = fit_exposure(drawn.image, target.images, target.masks)
             row["fitted/psnr"] = self._protocol.psnr(fitted, target).item()
-            if seen_from is not None:
-                shown = seen_by_inputs(drawn.depth, target.cameras, *seen_from)
-                row["seen/share"] = shown.float().mean().item()
-                shown = shown if target.masks is None else shown & target.masks
-                row["seen/psnr"] = of_pixels.psnr(image, replace(target, masks=shown)).item()
-            rows.append(row)
-            depths.append(drawn.depth)
-        return rows, torch.cat(depths)
+            yield row, replace(drawn, image=image)
+
+    def _of_seen(
+        self, image: Float[Tensor, "1 3 H W"], target: Views, shown: Bool[Tensor, "1 H W"]
+    ) -> dict[str, float]:
+        """Compute the share of the pixels that inputs see, and their PSNR."""
+        of_pixels = replace(self._protocol, psnr_over="masks")
+        seen = shown if target.masks is None else shown & target.masks
+        quality = of_pixels.psnr(image, replace(target, masks=seen)).item()
+        return {"seen/share": shown.float().mean().item(), "seen/psnr": quality}
 
     @torch.no_grad()
     def _save_contact_sheet(self, name: str, scene: Gaussians | AnchorScene) -> None:
@@ -241,7 +251,7 @@ class Results:
         kind, views = ("inputs", inputs) if held_out is None else ("held_out", held_out)
         rows = min(SHEET_ROWS, views.num_views)
         shown = torch.linspace(0, views.num_views - 1, rows).round().long()
-        views, exposures = views.select(shown), self._exposures[kind]
+        views, exposures = views.select(shown).decoded(), self._exposures[kind]
         rendering = self._draw(scene, views.cameras)
         if exposures is not None:
             image = expose(rendering.image, exposures[shown.to(exposures.device)])
@@ -276,6 +286,11 @@ def save_gaussians(path: Path, gaussians: Gaussians, notes: Notes = NO_NOTES) ->
                 continue
             raise InputError(f"{failure} The scene was written to {rescued}.") from None
         raise
+
+
+def _depth(drawn: Rendering) -> Float[Tensor, "V H W"]:
+    assert drawn.depth is not None
+    return drawn.depth
 
 
 def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +11,7 @@ from torch import Tensor
 from asysplat.kernels.dispatch import to_float64
 from asysplat.models.prior.prior import DepthEstimate
 from asysplat.refinement.init import MIN_CONFIDENCE, depth_views, sweep
-from asysplat.scene import Cameras, Views
+from asysplat.scene import Cameras, Views, decode
 
 CLIPPED = 0.99  # least color that may have been brighter
 NEAREST = 8  # other photographs that each is compared with
@@ -61,9 +60,10 @@ def even_exposures(views: Views, exposures: Float[Tensor, "V 3"]) -> Views:
 
     Pixels that are clipped in a brighter photograph are masked out: their colors are unknown.
     """
-    images = expose(views.images, -exposures).clamp(0, 1)
-    clipped = ((views.images >= CLIPPED) & (exposures > 0)[..., None, None]).any(1)
-    return replace(views, images=images).without(clipped)
+    darker = views.with_images(lambda view, one: expose(one.images, -exposures[[view]]).clamp(0, 1))
+    brighter = (exposures > 0)[..., None, None]
+    clipped = [(decode(i) >= CLIPPED) & b for i, b in zip(views.images, brighter, strict=True)]
+    return darker.without(torch.stack([channels.any(0) for channels in clipped]))
 
 
 def expose(
@@ -95,7 +95,7 @@ def _compare(
     inverse, known = estimate.inverse_depth[0], estimate.confidence[0] > MIN_CONFIDENCE
     known &= inverse > 0
     small, rows = views.resized(*inverse.shape[-2:]), {view: row for row, view in enumerate(swept)}
-    images, cameras = small.images, small.cameras
+    images, cameras = decode(small.images), small.cameras
     if small.masks is not None:
         images = images * small.masks[:, None]  # too dark to compare
     poses, directions = cameras.cam_to_world, cameras.pixel_directions()

@@ -20,7 +20,7 @@ from asysplat.models.prior.prior import DepthEstimate
 from asysplat.refinement.footprints import footprints
 from asysplat.refinement.hull import within_hull
 from asysplat.rendering import INRIA
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Cameras, Gaussians, Views, decode
 
 INITS = ("network", "plane_sweep", "points", "depth")
 DEPTH_VIEWS = 64  # most views whose depths are used, evenly selected
@@ -165,7 +165,7 @@ def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "
         if views.masks is not None:
             valid = views.masks[view, row, column]
             visible, row, column = visible[valid], row[valid], column[valid]
-        total[visible] += views.images[view, :, row, column].mT
+        total[visible] += decode(views.images[view, :, row, column]).mT
         count[visible] += 1
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
 

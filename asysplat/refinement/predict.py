@@ -34,7 +34,7 @@ def predict(views: Views, seconds: float | int = 1.0, *, seed: int = 0) -> Gauss
     check_options({"seconds": seconds}, {"seconds": Positive})
     at_length = FEW if views.num_views <= DEFAULT.few_views else DEFAULT
     settings = BRIEF if seconds < BRIEF_UNTIL else at_length
-    views = views.validate("predict's views").decoded()
+    views = views.validate("predict's views")
     estimate = sweep(views)
     if seconds < STEPS_PAY_FROM * (time.perf_counter() - began):
         return gaussians_of_pixels(views, estimate)

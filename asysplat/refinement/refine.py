@@ -2,12 +2,10 @@
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
-from operator import itemgetter
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -52,12 +50,12 @@ class RefinementProgress:
     fraction: float  # fraction of the refinement that is done, in [0, 1]
     seconds: float  # seconds of its steps so far, without what watches it
     gaussians: int  # their number
-    errors: Sequence[Float[Tensor, ""]]  # mean squared errors of as many steps as input images
+    errors: Float[Tensor, "steps"]  # mean squared errors of as many steps as input images, at most
 
     @cached_property
     def psnr(self) -> float:
         """PSNR of the last steps, each before its update; a GPU is waited for, as it is read."""
-        return -10 * math.log10(max(float(torch.stack([*self.errors]).double().mean()), 1e-10))
+        return -10 * math.log10(max(self.errors.double().mean().item(), 1e-10))
 
 
 @runtime_checkable
@@ -98,7 +96,7 @@ class Refinement:
         if gaussians.num_gaussians == 0:
             raise InputError("refine got no Gaussians: start from at least one.")
         gaussians.validate("refine's gaussians")
-        views = views.validate("refine's views").decoded()
+        views = views.validate("refine's views")
         check_device("refine", "views", views.images, "gaussians", gaussians.means)
         self.settings, self._estimate = settings, estimate
         if background is None:
@@ -117,7 +115,7 @@ class Refinement:
 
         Where no Gaussian covers what they show, those of a plane sweep of all are added.
         """
-        views = views.validate("Refinement.add's views").decoded()
+        views = views.validate("Refinement.add's views")
         check_device("Refinement.add", "views", views.images, "the first", self.background)
         self._take(self._given.join(views))
         self.motions.append(views.num_views)
@@ -186,9 +184,7 @@ class Refinement:
         factor = settings.final_lr_factor**cooled
         errors, sums = [], ()
         for view in chosen:
-            # A slice copies nothing and waits for no GPU.
-            one = views.map(itemgetter(slice(view, view + 1)))
-            target, background = self._before_background(one)
+            target, background = self._before_background(views.one(view))
             mse, of_view = self._gradients(target, background, view, leaves, factor)
             self._densifier.observe_view(of_view[0], target.cameras)
             sums = list(map(torch.add, sums, of_view)) if sums else of_view
@@ -269,7 +265,7 @@ class Refinement:
     def _differences(self) -> Iterator[Float[Tensor, "1 3 H W"]]:
         gaussians = self.fields.gaussians()
         for row in range(self._given.num_views):
-            view = self._given.select([row])
+            view = self._given.one(row)
             cameras = view.cameras
             for motion in self.motions.leaves():
                 cameras = correct_poses(cameras, motion[row, None])
@@ -375,17 +371,18 @@ def run_steps(
     max_steps: float = math.inf,
 ) -> None:
     """Advance a refinement to the end of its budget, or for `max_steps`; see `refine`."""
-    errors: deque[Tensor] = deque(maxlen=refinement.views.num_views)
+    # One tensor: small ones of many steps, between large buffers, would fragment the memory.
+    errors = torch.zeros(refinement.views.num_views, device=refinement.views.images.device)
     step, progress = 0, 0.0
     passed = 0.0
     while progress < 1:
         clock = time.perf_counter()
-        errors.append(refinement.advance(progress))
+        errors[step % len(errors)] = refinement.advance(progress)
         passed += time.perf_counter() - clock
         step += 1
         used = (passed if budget.timed else step) / budget.amount
         progress = min(1.0, max(used, step / max_steps))
-        count, latest = refinement.num_gaussians, tuple(errors)
+        count, latest = refinement.num_gaussians, errors[:step].clone()
         status = RefinementProgress(step, progress, passed, count, latest)
         if watch is not None and watch(status, refinement):
             break

@@ -268,7 +268,7 @@ class ScaffoldRefinement:
 
     def step(self, progress: float, observing: bool) -> Float[Tensor, ""]:
         """Take a step on one view; return its mean squared error."""
-        scene, target = self.scene, self.views.select([next(self._view_order)])
+        scene, target = self.scene, self.views.one(next(self._view_order))
         camera = target.cameras
         parameters = scene.optimizer.parameters
         leaves = {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}

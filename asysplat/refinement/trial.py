@@ -29,7 +29,7 @@ def trial_gain(
     count = views.num_views // SITTING_OUT
     sitting_out = evenly_spaced(range(views.num_views), count + 2)[1:-1]
     rest = small.select([view for view in range(views.num_views) if view not in sitting_out])
-    target, background = small.select(sitting_out), rest.color_behind(rest.mean_color())
+    target, background = small.select(sitting_out).decoded(), rest.color_behind(rest.mean_color())
     estimate, errors = sweep(rest), []
     for tried in (settings, others):
         start = initial_gaussians("plane_sweep", rest, tried.initial_limit, estimate=estimate)

@@ -34,7 +34,7 @@ from asysplat.refinement.fields import correct_poses
 from asysplat.refinement.footprints import footprints
 from asysplat.rendering import render
 from asysplat.root import CONF
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Gaussians, Views, encode
 
 NAMES = [field.name for field in fields_of(Gaussians)]
 KINDS = ["error", "mcmc", "gradient", "none"]
@@ -96,6 +96,15 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(room, start,
         found.append(refine(start, room[0], settings, steps=12, seed=seed))
     assert same_bits(found[1], found[0])
     assert not torch.equal(found[2].sh, found[0].sh)
+
+
+def test_stored_photographs_give_the_bits_of_decoded_ones(small_room, start):
+    """But for the half size of the first steps, which is rounded to 8 bits."""
+    stored = replace(small_room, images=encode(small_room.images, torch.uint8))
+    settings = replace(DEFAULT, half_resolution_until=0.0, max_gaussians=2 * start.num_gaussians)
+    options = {"settings": settings, "steps": 30, "background": torch.zeros(3)}
+    one, other = (refine(start, views, **options) for views in (stored, stored.decoded()))
+    assert same_bits(one, other)
 
 
 @pytest.mark.medium

@@ -28,7 +28,7 @@ from asysplat.models.prior.projections import (
     smallest_step,
 )
 from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Cameras, Gaussians, Views, decode
 
 PLANES = 64
 NEIGHBORS = 4
@@ -71,10 +71,15 @@ class PlaneSweep(Network):
         while max(height, width) > self.longest_side * factor:
             factor *= 2
         small = views.cameras.resized(*(max(1, side // factor) for side in (height, width)))
-        images = views.images
-        if views.masks is not None:  # what is masked out has no effect
-            images = images.where(views.masks[..., None, :, :], 0.5)
-        images = shrink(images, small.height, small.width)
+
+        def shrunk(view: int) -> Float[Tensor, "B 3 h w"]:
+            image = decode(views.images[:, view])
+            if views.masks is not None:  # what is masked out has no effect
+                image = image.where(views.masks[:, view, None], 0.5)
+            return shrink(image, small.height, small.width)
+
+        # One by one: all views are not decoded at once.
+        images = torch.stack([shrunk(view) for view in range(views.num_views)], dim=1)
         masks = views.surfaces((small.height, small.width))
         return plane_sweep(images, small, planes=self.planes, neighbors=self.neighbors, masks=masks)
 

@@ -11,7 +11,7 @@ from asysplat.geometry.isotropic import isotropic_gaussians
 from asysplat.models.prior.fill import color_edges, fill_unknown
 from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import Consistency, load_backend
-from asysplat.scene import Gaussians, TensorRecord, Views
+from asysplat.scene import Gaussians, TensorRecord, Views, decode
 
 UNKNOWN_DISTANCE = 10**0.5  # the geometric mean of .1 and 100, the range of distances
 VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of the same surface
@@ -76,8 +76,7 @@ class Prior(TensorRecord):
         stride = views.cameras.height // size[0]
         fraction = F.avg_pool2d(known, stride)
         inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride)
-        images = F.interpolate(views.images.flatten(0, 1), size, mode="area")
-        edges = color_edges(images.unflatten(0, (scenes, count))).to(inverse)
+        edges = color_edges(decode(views.resized(*size).images)).to(inverse)
         inverse = fill_unknown(inverse / fraction.clamp_min(1e-6), fraction, edges)
         others = other_views(count, scenes, inverse.device)
         projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
@@ -95,7 +94,7 @@ class Prior(TensorRecord):
         cameras = views.cameras.resized(*size)
         origins, directions = cameras.rays()
         distance = self.distance.to(directions)
-        colors = F.interpolate(views.images.flatten(0, 1), size, mode="area").movedim(1, -1)
+        colors = decode(views.resized(*size).images).flatten(0, 1).movedim(1, -1)
         gaussians = isotropic_gaussians(
             (origins + distance[..., None] * directions).flatten(0, 3),
             (distance / cameras.intrinsics[..., 0, 0, None, None] * spread).flatten(),

@@ -55,7 +55,8 @@ class ErrorDensifier(Densifier):
         count = target - len(self.fields)
         if count > 0:
             order = random_permutation(views.num_views, self.generator)
-            views, gaussians = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
+            views = views.select(order[:VIEWS_PER_ROUND]).decoded()
+            gaussians = self.fields.gaussians()
             background, cameras = self.background, views.cameras
             out = render(gaussians, cameras, background, depth="median", views_at_once=1)
             assert out.depth is not None

@@ -103,7 +103,7 @@ def test_images_that_blender_s_scenes_test_are_held_out(centered_views, tmp_path
     names = [f"test/r_{index}.png" for index in range(4)]
     assert [file.removeprefix(f"{tmp_path}/") for file in photographs.held_out_files] == names
     assert photographs.inputs.num_views == 8 and (photographs.inputs.alphas[:, :8] == 0).all()
-    assert (photographs.inputs.images[:, :, :8] == 1).all()
+    assert (photographs.inputs.images[:, :, :8] == 255).all()
     alone = open_photographs(tmp_path, height=24, held_out_every=None, say=lambda text: None)
     assert alone.held_out is None and alone.inputs.num_views == 8
     source = FilesSource(str(tmp_path), SceneOptions(24, 32), window=None)
