@@ -15,7 +15,7 @@ from asysplat.doctor import processor
 from asysplat.errors import InputError
 
 NAMES = ("render", "ops", "model", "data", "formats", "pareto", "systems")
-NAMES = (*NAMES, "bench", "device", "launches", "depths")
+NAMES = (*NAMES, "photographs", "bench", "device", "launches", "depths")
 SUITES = {name: f"benchmarks.{name}" for name in NAMES}
 SUITES |= {name: f"benchmarks.{name}.report" for name in ("public", "stability", "machine_code")}
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}

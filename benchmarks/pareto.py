@@ -79,7 +79,6 @@ TRACKED = TrackedMetrics(
 )
 TITLES = {
     "feed_forward": "Feed-forward",
-    "sequence": "Feed-forward, more and more photographs",
     "networks": "Other layers, untrained",
     "refined": "Refined",
     "reconstruct": "Refined for some seconds",
@@ -202,7 +201,7 @@ class Refined:
         return run
 
 
-FAMILIES = dict.fromkeys(("feed_forward", "sequence", "networks"), FeedForward)
+FAMILIES = dict.fromkeys(("feed_forward", "networks"), FeedForward)
 FAMILIES |= dict.fromkeys(("refined", "reconstruct"), Refined)
 Setting = FeedForward | Refined
 

@@ -16,7 +16,9 @@ FILES = [path for path in sorted(FOLDER.rglob("*.json")) if path.stem in SUITES]
 MEASURED = {"data": ("views_per_second", 0.1), "bench": ("ratio", 10), "pareto": ("seconds", 10)}
 MEASURED |= {"stability": ("error", 10), "formats": ("write", 10), "device": ("kernels", 10)}
 MEASURED |= {"machine_code": ("instructions", 2), "launches": ("launches", 2)}
-MEASURED |= {"depths": ("absrel", 10)} | dict.fromkeys(("systems", "public"), ("psnr", 0.1))
+MEASURED |= {"depths": ("absrel", 10)} | dict.fromkeys(
+    ("systems", "public", "photographs"), ("psnr", 0.1)
+)
 
 
 def test_every_suite_has_a_committed_result():

@@ -27,13 +27,14 @@ class Effort:
     max_side: int  # pixels of the longer side; larger images are shrunk to find features
     features: int  # greatest number in an image
     contrast: float  # least of a feature
-    guided: bool  # whether matches are sought again along epipolar lines
+    ratio: float  # greatest of the distances to the best and to the second-best match
     pair: int  # least number of inliers of a pair
+    guided: bool = False  # whether matches are sought again along epipolar lines, which takes long
 
 
-USUAL = Effort(1600, 4096, 0.0067, guided=False, pair=15)
-FURTHER = replace(USUAL, guided=True, pair=10)
-HARD = Effort(3200, 8192, 0.002, guided=True, pair=10)
+USUAL = Effort(1600, 4096, 0.0067, ratio=0.8, pair=15)
+HARD = Effort(3200, 8192, 0.002, ratio=0.9, pair=10)
+FURTHER = replace(USUAL, pair=10, guided=True)
 
 
 def match_photographs(
@@ -105,10 +106,11 @@ def likely_pairs(database: Path, names: Sequence[str]) -> list[tuple[str, str]]:
 
 def match_further(
     database: Path, names: Sequence[str], without: Sequence[str], progress: Progress
-) -> bool:
-    """Match photographs `without` a camera with more of the others; return whether there are any.
+) -> None:
+    """Match photographs `without` a camera with more of the others.
 
-    Of a sequence, they are matched along epipolar lines with those AROUND and with anchors.
+    Of a sequence, they are matched along epipolar lines with those AROUND and with anchors; where
+    all pairs were matched, once more with those that matched them most.
     """
     order = {name: number for number, name in enumerate(names)}
     pairs = set()
@@ -117,8 +119,15 @@ def match_further(
         others = {*near, *_anchors(len(names))} - {number}
         pairs |= {(min(number, other), max(number, other)) for other in others}
     pairs -= {(order[first], order[second]) for first, second in _pairs(names)}
-    _match(database, [(names[i], names[j]) for i, j in sorted(pairs)], FURTHER, progress)
-    return len(pairs) > 0
+    named = [(names[i], names[j]) for i, j in sorted(pairs)]
+    if not named:
+        named = [pair for pair in likely_pairs(database, names) if not {*without}.isdisjoint(pair)]
+        with pycolmap.Database.open(database) as stored:
+            numbers = {image.name: image.image_id for image in stored.read_all_images()}
+            for first, second in named:  # else they would not be matched again
+                stored.delete_matches(numbers[first], numbers[second])
+                stored.delete_two_view_geometry(numbers[first], numbers[second])
+    _match(database, named, FURTHER, progress)
 
 
 def _match(
@@ -126,6 +135,7 @@ def _match(
 ) -> None:
     task = progress.add_task("matches", total=len(pairs))
     matching = pycolmap.FeatureMatchingOptions(guided_matching=effort.guided)
+    matching.sift.max_ratio = effort.ratio
     verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=effort.pair)
     verification.ransac.random_seed = SEED
     for chunk in _chunks(pairs, CHUNK**2):

@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.cameras.features import (
+    ALL_PAIRS,
     HARD,
     SEED,
     USUAL,
@@ -71,7 +72,8 @@ def find_cameras(
     frames of a video; its masks/ are theirs, and what they leave out is not matched; its sparse/0
     has the cameras and points. Where fewer than 9 of 10 cameras are found, the photographs of a
     sequence that are left are matched with more of the others; if there still are, a second attempt
-    with weaker features of the pairs that matched most follows, and the better one is returned.
+    with weaker features of the pairs that matched most follows, and at its end one along epipolar
+    lines for those that are left; the best is returned.
 
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
@@ -166,15 +168,17 @@ def _reconstruct(
 ) -> pycolmap.Reconstruction | None:
     """Return the largest model that can be built; images of the same lens have one camera.
 
-    Of a sequence, those that it left open are matched further, and it goes on with them.
+    Of a sequence, or in the last attempt, those that it left open are matched further, and it goes
+    on with them.
     """
     model = _map(work, lenses, database, attempt, progress)
     if model is None or _registered(model) >= ENOUGH * len(lenses):
         return model
     found = {image.name for image in model.images.values() if image.has_pose}
     without = [name for name in lenses if name not in found]
-    if not match_further(database, list(lenses), without, progress):
-        return model
+    if len(lenses) <= ALL_PAIRS and attempt is not ATTEMPTS[-1]:
+        return model  # weaker features of all are found sooner, and their cameras are more exact
+    match_further(database, list(lenses), without, progress)
     further = _map(work, lenses, database, ATTEMPTS[-1], progress, model)
     return max(model, further, key=_registered)
 

@@ -1,6 +1,7 @@
 """Cameras that are found for photographs of a synthetic scene are those that rendered them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -199,6 +200,28 @@ def test_a_second_attempt_matches_what_matched_most(views, tmp_path, monkeypatch
     first, second = asked
     apart = [abs(int(one[:-4]) - int(other[:-4])) for one, other in second]
     assert first is None and 8 <= len(apart) <= 16 and max(apart) <= 3
+
+
+@pytest.mark.medium
+def test_photographs_that_are_left_are_matched_again_along_epipolar_lines(views, tmp_path):
+    save_first(views, 6, tmp_path / "images")
+    names = [file.name for file in sorted((tmp_path / "images").iterdir())]
+    weak = replace(features.USUAL, ratio=0.5)
+
+    def inliers():
+        with pycolmap.Database.open(database) as stored:
+            geometries = zip(*stored.read_two_view_geometry_num_inliers(), strict=True)
+            return {pycolmap.pair_id_to_image_pair(pair): count for pair, count in geometries}
+
+    with Progress(disable=True) as progress:
+        lenses = dict.fromkeys(names, "lens")
+        database = features.match_photographs(tmp_path, lenses, weak, progress)
+        before = inliers()
+        features.match_further(database, names, [names[2]], progress)
+    after = inliers()
+    of_it = {pair for pair in before if 3 in pair}
+    assert len(of_it) == 5 and sum(after[pair] - before[pair] for pair in of_it) > 50
+    assert all(after[pair] == before[pair] for pair in before.keys() - of_it)
 
 
 def test_names_that_differ_by_spaces(views, tmp_path):
