@@ -113,7 +113,8 @@ class Refinement:
     def add(self, views: Views) -> None:
         """Take more photographs, in the frame and the size of the first ones.
 
-        Where no Gaussian covers what they show, those of a plane sweep of all are added.
+        Where no Gaussian covers what they show, those of a plane sweep of all are added; without
+        room for them, those are left out that show the least.
         """
         views = views.validate("Refinement.add's views")
         check_device("Refinement.add", "views", views.images, "the first", self.background)
@@ -121,9 +122,13 @@ class Refinement:
         self.motions.append(views.num_views)
         self._estimate = sweep(self.views)
         self.__dict__.pop("_known_depths", None)
-        limit = max(1, self._max_gaussians - len(self.fields))
+        limit, known = self.settings.initial_limit, self.fields.gaussians()
         found = initial_gaussians("plane_sweep", self.views, limit, estimate=self._estimate)
-        found = found.keep(~is_covered(found.means, self.fields.gaussians(), views.cameras))
+        found = found.keep(~is_covered(found.means, known, views.cameras))
+        kept = self._max_gaussians - found.num_gaussians
+        if kept < known.num_gaussians:
+            shown = blending_weights(known, self.views.cameras, self.views.masks)
+            self.fields.keep(shown.topk(max(1, kept)).indices.sort().values)
         if found.num_gaussians:
             self.fields.append(found, self._units(found.means))
         self._densifier = self._make_densifier()

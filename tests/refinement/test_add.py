@@ -38,6 +38,19 @@ def quality(refinement, views):
     return psnr(image.clamp(0, 1), views.images).mean().item()
 
 
+def test_what_shows_the_least_makes_room_for_new_places(walk):
+    (first, second), (_, of_second) = walk
+    settings = replace(DEFAULT, max_gaussians=2000, initial_fraction=0.5)
+    start = initial_gaussians("plane_sweep", first, settings.initial_limit)
+    refinement = Refinement(start, first, settings=settings)
+    advance(refinement, 60, 0.0, 0.65)
+    assert len(refinement.fields) == 2000
+    unseen = quality(refinement, of_second)
+    refinement.add(second)
+    assert 1900 < len(refinement.fields) <= 2000
+    assert quality(refinement, of_second) > unseen + 0.2
+
+
 def test_new_places_are_started_and_old_ones_kept(walk):
     (first, second), (of_first, of_second) = walk
     settings = replace(DEFAULT, max_gaussians=8000)
