@@ -128,11 +128,12 @@ def test_as_many_photographs_as_memory_holds(scene):
     said, one = [], 24 * 32 * photographs.BYTES_PER_PIXEL / 1e9
     options = {"height": 24, "views": None, "held_out_every": None, "say": said.append}
     assert asysplat.open_photographs(scene, **options).inputs.num_views == 4
-    some = asysplat.open_photographs(scene, **options, max_gb=3.5 * one)
+    measuring = photographs.MEASURING * one
+    some = asysplat.open_photographs(scene, **options, max_gb=3.5 * one + measuring)
     assert some.inputs.num_views == 3
     assert "3 of 4 photographs are used: memory_gb= holds no more." in said
     with pytest.raises(InputError, match=r"^memory_gb leaves .* of which two of 24x32 pixels take"):
-        asysplat.open_photographs(scene, **options, max_gb=1.5 * one)
+        asysplat.open_photographs(scene, **options, max_gb=1.5 * one + measuring)
 
 
 MISTAKES = {

@@ -25,6 +25,7 @@ from asysplat.scene import Cameras, Views
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: bad images are decoded at it, before the size is known
 BYTES_PER_PIXEL = 8  # of a reconstruction: RGB, the same at half the size, maps, copies of some
+MEASURING = 300  # photographs that take as much as the rendering and the metrics of one
 RANGES = {
     "height": Count,
     "width": Count | None,
@@ -144,15 +145,16 @@ def open_photographs(
             f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
         )
     count, one_gb = min(views or len(rest), len(rest)), height * width * BYTES_PER_PIXEL / 1e9
-    if max_gb < 2 * one_gb:
+    room = max_gb / one_gb - MEASURING
+    if room < 2:
         raise InputError(
             f"memory_gb leaves {max(0, max_gb):.2g} GB for photographs, of which two of "
-            f"{height}x{width} pixels take {2 * one_gb:.2g}: give more, or lower height= or "
-            "refinement.max_gaussians=."
+            f"{height}x{width} pixels take {(2 + MEASURING) * one_gb:.2g}: give more, or lower "
+            "height= or refinement.max_gaussians=."
         )
-    if count * one_gb > max_gb:
-        say(f"{int(max_gb / one_gb)} of {count} photographs are used: memory_gb= holds no more.")
-        count = int(max_gb / one_gb)
+    if count > room:
+        say(f"{int(room)} of {count} photographs are used: memory_gb= holds no more.")
+        count = int(room)
     inputs = evenly_spaced(rest, count)
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:

@@ -122,13 +122,14 @@ class Refinement:
         self.motions.append(views.num_views)
         self._estimate = sweep(self.views)
         self.__dict__.pop("_known_depths", None)
-        limit, known = self.settings.initial_limit, self.fields.gaussians()
+        known, half = self.fields.gaussians(), max(1, self._max_gaussians // 2)
+        limit = min(half, self.settings.initial_limit)
         found = initial_gaussians("plane_sweep", self.views, limit, estimate=self._estimate)
         found = found.keep(~is_covered(found.means, known, views.cameras))
         kept = self._max_gaussians - found.num_gaussians
         if kept < known.num_gaussians:
             shown = blending_weights(known, self.views.cameras, self.views.masks)
-            self.fields.keep(shown.topk(max(1, kept)).indices.sort().values)
+            self.fields.keep(shown.topk(kept).indices.sort().values)
         if found.num_gaussians:
             self.fields.append(found, self._units(found.means))
         self._densifier = self._make_densifier()
