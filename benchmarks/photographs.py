@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
@@ -28,7 +29,7 @@ from asysplat.scene import Cameras
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TrackedMetrics
 from benchmarks.pareto import NOISE_OF_SECONDS, find_scenes
 from benchmarks.systems import measure_quality
-from benchmarks.table import Columns, machine_note, make_table, number_column
+from benchmarks.table import Columns, machine_text, make_table, number_column, text_column
 from benchmarks.timing import Result
 from paper.style import FAINT, OURS, PAPER, STYLE
 
@@ -97,21 +98,19 @@ def measure_one(
 
 
 def tables(results: Result) -> list[Table]:
-    """Show each scene."""
+    """Show all scenes."""
     absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
-    notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
-    scenes = dict.fromkeys(row["scene"] for row in results["rows"])
-    return [
-        make_table(scene, COLUMNS, [row for row in results["rows"] if row["scene"] == scene], notes)
-        for scene in scenes
-    ]
+    notes = "\n".join(filter(None, (machine_text(results), NOTES, absent)))
+    return [make_table("More and more photographs", COLUMNS, results["rows"], notes)]
 
 
 def plot(results: Result) -> Figure:
     """Plot quality, seconds and memory over the number of photographs, a line for each scene."""
-    rows, colors = results["rows"], (OURS, PAPER, "#2f8f4e", FAINT)
-    scenes = dict(zip(dict.fromkeys(row["scene"] for row in rows), colors, strict=False))
-    styles = dict(zip(dict.fromkeys(row["asked"] for row in rows), ("--", "-", ":"), strict=False))
+    rows = results["rows"]
+    scenes, durations = (dict.fromkeys(row[name] for row in rows) for name in ("scene", "asked"))
+    colors = cycle((OURS, PAPER, "#2f8f4e", FAINT))
+    scenes = dict(zip(scenes, colors, strict=False))
+    styles = dict(zip(durations, cycle(("--", "-", ":")), strict=False))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(13.5, 4.2), layout="constrained")
         for axes, (name, title) in zip(figure.subplots(1, 3), PANELS.items(), strict=True):
@@ -132,6 +131,7 @@ def plot(results: Result) -> Figure:
 
 
 COLUMNS: Columns = {
+    "scene": text_column("{scene}"),
     "photographs": number_column("views", "{:.0f}"),
     "asked": number_column("asked", "{:g}"),
     "s": number_column("seconds", "{:.1f}"),

@@ -204,8 +204,8 @@ class Results:
             rows += [label | row for label, row in zip(labels, of_views, strict=True)]
         if held_out is not None:
             baselines = self._protocol.measure_baselines(inputs, held_out, self._lpips)
-            for name, numbers in baselines.items():
-                results |= _means(f"baseline/{name}", numbers)
+            for name, of_views in baselines.items():
+                results |= _means(f"baseline/{name}", of_views)
         write_json(self.folder / "metrics.json", results)
         write_csv(self.folder / "metrics.csv", rows)
         _print_table(results)

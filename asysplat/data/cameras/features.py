@@ -27,7 +27,7 @@ class Effort:
     max_side: int  # pixels of the longer side; larger images are shrunk to find features
     features: int  # greatest number in an image
     contrast: float  # least of a feature
-    ratio: float  # greatest of the distances to the best and to the second-best match
+    ratio: float  # greatest distance of a match, over that of the second best
     pair: int  # least number of inliers of a pair
     guided: bool = False  # whether matches are sought again along epipolar lines, which takes long
 

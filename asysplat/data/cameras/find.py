@@ -174,10 +174,10 @@ def _reconstruct(
     model = _map(work, lenses, database, attempt, progress)
     if model is None or _registered(model) >= ENOUGH * len(lenses):
         return model
-    found = {image.name for image in model.images.values() if image.has_pose}
-    without = [name for name in lenses if name not in found]
     if len(lenses) <= ALL_PAIRS and attempt is not ATTEMPTS[-1]:
         return model  # weaker features of all are found sooner, and their cameras are more exact
+    found = {image.name for image in model.images.values() if image.has_pose}
+    without = [name for name in lenses if name not in found]
     match_further(database, list(lenses), without, progress)
     further = _map(work, lenses, database, ATTEMPTS[-1], progress, model)
     return max(model, further, key=_registered)
