@@ -29,10 +29,10 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from asysplat import load
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 from asysplat.interrupts import handle_signals
-from asysplat.load import load
 from asysplat.models import BiMamba2, LongLRMHead, SingleBranch
 
 # Networks of the loss, which the checkpoint holds too.

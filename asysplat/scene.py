@@ -536,6 +536,11 @@ class Gaussians(TensorRecord):
         """Scale means and sizes: the same scene in units that are `factor` times smaller."""
         return replace(self, means=self.means * factor, scales=self.scales * factor)
 
+    def join(self, others: "Gaussians") -> "Gaussians":
+        """Return these Gaussians, [N], and then others with as many coefficients."""
+        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
+        return Gaussians(*map(torch.cat, pairs))
+
     def keep(self, mask: Bool[Tensor, "N"]) -> "Gaussians":
         """Return the Gaussians where `mask` is True; for one scene, without batch dimensions."""
         return self.map(lambda tensor: tensor[mask])

@@ -1,7 +1,7 @@
 """Fit the Gaussians of one scene to its images: initialization, merging, refinement."""
 
 from asysplat.refinement.init import merge_to_limit
-from asysplat.refinement.predict import predict
+from asysplat.refinement.predict import predict, predict_in_windows
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine, without_unseen
 from asysplat.refinement.scaffold_gs import (
     SCAFFOLD_GS,
@@ -37,6 +37,7 @@ __all__ = [
     "for_views",
     "merge_to_limit",
     "predict",
+    "predict_in_windows",
     "refine",
     "refine_scaffold",
     "with_options",

@@ -1,13 +1,16 @@
 """Gaussians of photographs in so many seconds."""
 
+import itertools
 import sys
 
 import pytest
 import torch
 
+from asysplat import load
+from asysplat.data import ProceduralScene
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
-from asysplat.refinement import BRIEF, DEFAULT, FEW, predict, refine
+from asysplat.refinement import BRIEF, DEFAULT, FEW, predict, predict_in_windows, refine
 from asysplat.refinement.init import gaussians_of_pixels, initial_gaussians, sweep
 from asysplat.rendering import render
 
@@ -60,3 +63,17 @@ def test_without_time_for_steps_it_is_the_plane_sweep_unmerged(room):
     assert held_out_psnr(sharp, room) > held_out_psnr(merged, room) + 1
     with pytest.raises(InputError, match="seconds"):
         predict(room[0], 0)
+
+
+@pytest.mark.medium
+def test_windows_are_as_good_as_the_whole():
+    network, views_at_once, differences = load("shipped"), [], []
+    network.register_forward_pre_hook(lambda _, views: views_at_once.append(views[0].num_views))
+    for seed, places in itertools.product((0, 1), ("rooms", "outdoors")):
+        scene = ProceduralScene(seed, 45, 60, 48, places=places)
+        views = scene.views(range(0, 46, 2)), scene.views(range(3, 48, 8))
+        whole, halves = (predict_in_windows(network, views[0], window) for window in (23, 12))
+        differences.append(held_out_psnr(halves, views) - held_out_psnr(whole, views))
+        assert halves.num_gaussians < 0.7 * whole.num_gaussians
+    assert sum(differences) / len(differences) > -0.2, differences
+    assert views_at_once == [23, 12, 11] * 4
