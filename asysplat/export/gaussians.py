@@ -196,5 +196,5 @@ def camera_before(gaussians: Gaussians) -> Cameras:
     radius = (gaussians.means - center).norm(dim=-1).median()
     pose = torch.eye(4)
     pose[:3, 3] = center - torch.tensor([0.0, 0.0, 3.0]) * radius
-    intrinsics = torch.tensor([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    return Cameras(intrinsics[None], pose[None], 1, 1)
+    intrinsics = torch.tensor([[256, 0, 128], [0, 256, 128], [0, 0, 1.0]])
+    return Cameras(intrinsics[None], pose[None], 256, 256)

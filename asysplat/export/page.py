@@ -10,13 +10,15 @@ from pathlib import Path
 from string import Template
 
 import numpy as np
+import torch
 
+from asysplat.data.selection import evenly_spaced
 from asysplat.errors import InputError
-from asysplat.export.formats import spz
+from asysplat.export.formats import packing, spz
 from asysplat.export.viewer_cameras import mean_up, quaternion
 from asysplat.files import atomic_write
 from asysplat.geometry import spherical_harmonics
-from asysplat.rendering.interface import INRIA
+from asysplat.rendering import INRIA, blending_weights
 from asysplat.scene import Cameras, Gaussians
 
 PAGE = ".html"
@@ -25,6 +27,8 @@ FILES = Path(__file__).parent / "page_files"
 SCRIPTS = ("scene.js", "camera.js", "renderer.js", "viewer.js")  # one module, in this order
 SH_FACTORS = ("SH_C0", "Y1", "Y2", "Y2_0", "Y3_3", "Y3_2", "Y3_1", "Y3_0")
 HALF_TURN = np.array([1.0, -1.0, -1.0])  # from our axes to SPZ's
+FIRST_PART = 0.1  # fraction of the Gaussians that a page draws before it has the others
+WEIGHED_VIEWS = 16  # most cameras whose images decide which they are
 DIGITS = 9  # significant, of a camera's numbers: those of float32
 # In JSON, what could end a script element or, in old browsers, a string.
 UNSAFE = {ord(character): f"\\u{ord(character):04x}" for character in "<>&\u2028\u2029"}
@@ -42,7 +46,8 @@ def write_page(
 ) -> None:
     """Write one scene and its viewer as one HTML file, which needs no server and no network.
 
-    The page draws what `render` draws, of Gaussians as SPZ rounds them (see `write_spz`).
+    The page draws what `render` draws, of Gaussians as SPZ rounds them (see `write_spz`). The
+    tenth that shows most stands first in the file, and is drawn once it has come.
 
     Args:
         path: the file, .html.
@@ -91,13 +96,15 @@ def write_page(
         "background": [float(value) for value in background],
         "defines": _defines(gaussians, antialiased),
     }
+    first, rest = _parts(packing.prepare_for_export(gaussians), cameras)
     style, script = _read("style.css"), "".join(map(_read, SCRIPTS))
     page = Template(_read("page.html")).substitute(
         title=escape(title or path.stem),
         policy=_policy(style, script),
         style=style,
         settings=json.dumps(settings, separators=(",", ":")).translate(UNSAFE),
-        spz=b64encode(spz.encode_spz(gaussians)).decode(),
+        first=first,
+        rest=rest,
         worker=_read("worker.js"),
         script=script,
     )
@@ -107,6 +114,19 @@ def write_page(
 
 def _read(name: str) -> str:
     return (FILES / name).read_text(encoding="utf-8")
+
+
+def _parts(gaussians: Gaussians, cameras: Cameras) -> tuple[str, str]:
+    """Return the Gaussians that are drawn first, and the rest, if any, as SPZ in base64."""
+    count = min(WEIGHED_VIEWS, cameras.num_views)
+    chosen = cameras.select(evenly_spaced(range(cameras.num_views), count)).to(torch.float32)
+    weights = blending_weights(gaussians, chosen)
+    count = max(1, int(FIRST_PART * gaussians.num_gaussians))
+    is_first = torch.zeros_like(weights, dtype=torch.bool)
+    is_first[weights.topk(count).indices] = True
+    parts = (gaussians.keep(mask) for mask in (is_first, ~is_first) if mask.any())
+    first, *rest = (b64encode(spz.encode_spz(part)).decode() for part in parts)
+    return first, "".join(rest)
 
 
 def _defines(gaussians: Gaussians, antialiased: bool) -> str:

@@ -4,8 +4,11 @@ import base64
 import io
 import json
 import re
+import threading
+from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -16,7 +19,8 @@ from PIL import Image
 from asysplat.errors import InputError
 from asysplat.export import write_page
 from asysplat.export.formats.spz import encode_spz, read_spz, write_spz
-from asysplat.rendering import render
+from asysplat.rendering import blending_weights, render
+from asysplat.scene import Gaussians
 
 HEIGHT, WIDTH = 120, 160
 MIN_PSNR, MIN_SAME_PSNR = 30, 45  # to the scene; to the scene as SPZ rounds it
@@ -48,7 +52,17 @@ class Elements(HTMLParser):
         return next(text for tag, a, text in self.all if name in (tag, a.get("id"))).strip()
 
 
-def test_a_page_has_all_that_it_needs(scene, tmp_path):
+@pytest.fixture
+def read(tmp_path):
+    def read(content: bytes | str) -> Gaussians:
+        content = base64.b64decode(content) if isinstance(content, str) else content
+        (tmp_path / "part.spz").write_bytes(content)
+        return read_spz(tmp_path / "part.spz")
+
+    return read
+
+
+def test_a_page_has_all_that_it_needs(scene, tmp_path, read):
     gaussians, cameras = scene
     write_page(tmp_path / "scene.html", gaussians, cameras, focus=[1.0, 2.0, 3.5])
     text = (tmp_path / "scene.html").read_text(encoding="utf-8")
@@ -57,7 +71,12 @@ def test_a_page_has_all_that_it_needs(scene, tmp_path):
     links = set(re.findall(r"https?://[^\s)]+", text))
     assert links <= {"https://github.com/nianticlabs/spz"}  # in a comment
     assert not re.search(r"@import|url\(|\bimport\b|XMLHttp|fetch\(\"", text)
-    assert base64.b64decode(elements.text("spz")) == encode_spz(gaussians)
+    first, rest = (read(text) for _, a, text in elements.all if a.get("class") == "spz")
+    assert (first.num_gaussians, rest.num_gaussians) == (5, 45)
+    weights = blending_weights(gaussians, cameras)
+    is_first = weights >= weights.topk(5).values[-1]
+    assert first.means.equal(read(encode_spz(gaussians.keep(is_first))).means)
+    assert rest.means.equal(read(encode_spz(gaussians.keep(~is_first))).means)
     settings = json.loads(elements.text("settings"))
     assert settings["image"] == [WIDTH, HEIGHT]
     assert [len(camera) for camera in settings["path"]] == [11] * 3
@@ -168,6 +187,51 @@ def test_what_is_on_the_screen_is_the_first_camera_s_image(browser, scene, tmp_p
     wide = pixels(tab.send("Page.captureScreenshot")["data"])
     assert psnr(wide[..., WIDTH // 2 : -WIDTH // 2], target) > MIN_PSNR
     assert wide[..., : WIDTH // 2].any()
+
+
+@contextmanager
+def sent_in_two(page: bytes, end_of_first: int):
+    """Serve a page of which the rest is sent later: yield its address, and a function for that."""
+    rest = threading.Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(page[:end_of_first])
+            rest.wait(60)
+            self.wfile.write(page[end_of_first:])
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}", rest.set
+        server.shutdown()
+
+
+@pytest.mark.medium
+def test_a_tenth_is_drawn_before_the_rest_has_come(browser, make_scene, tmp_path):
+    gaussians, cameras = make_scene(4000, 3, HEIGHT, WIDTH, dtype=torch.float32)
+    gaussians = replace(gaussians, scales=gaussians.scales / 8)
+    write_page(tmp_path / "scene.html", gaussians, cameras)
+    tab = browser.open(tmp_path / "scene.html")
+    tab.evaluate("asysplat.ready")
+    whole = tab.evaluate("asysplat.picture(1)")
+    page = (tmp_path / "scene.html").read_bytes()
+    middle = page.rindex(b'class="spz"') + 1000
+    assert middle < 0.5 * len(page), (middle, len(page))
+    with sent_in_two(page, middle) as (address, send_rest):
+        tab.send("Page.navigate", url=address)
+        tab.wait("document.getElementById('message')?.hidden")
+        first = tab.evaluate("asysplat.picture(1)")
+        assert first != whole and pixels(first.partition(",")[2]).any()
+        assert tab.evaluate("document.readyState") == "loading"
+        send_rest()
+        tab.evaluate("asysplat.ready")
+        assert tab.evaluate("asysplat.picture(1)") == whole
 
 
 @pytest.mark.medium

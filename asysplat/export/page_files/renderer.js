@@ -100,8 +100,8 @@ void main() {
 }`;
 
 class Renderer {
-  /** Prepare a canvas: compile the shaders, write the Gaussians to textures. */
-  constructor(canvas, scene, { defines, background, image }) {
+  /** Prepare a canvas: compile the shaders, create the textures. */
+  constructor(canvas, { defines, background, image }) {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
     if (!gl) throw Error("this browser has no WebGL 2, or it is switched off");
     // In 8 bits, most of what faint splats contribute would be lost, and depths end at 1.
@@ -124,7 +124,6 @@ class Renderer {
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
       gl.uniform1i(this.uniform(name), unit);
-      if (name in scene) this.write(name, scene[name]);
     });
 
     const target = gl.createRenderbuffer();
@@ -165,6 +164,11 @@ class Renderer {
     padded.set(data);
     gl.activeTexture(gl.TEXTURE0 + Object.keys(this.formats).indexOf(name));
     gl.texImage2D(gl.TEXTURE_2D, 0, format[0], WIDTH, rows, 0, format[1], format[2], padded);
+  }
+
+  /** Write the Gaussians to textures. */
+  setScene(scene) {
+    for (const name in scene) this.write(name, scene[name]);
   }
 
   /** Set the Gaussians to draw, farthest first. */

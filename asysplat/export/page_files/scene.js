@@ -3,6 +3,17 @@
 
 const HEADER = 16; // bytes
 
+/** Return the Gaussians of several parts, one after the other. */
+async function unpackAll(parts) {
+  const unpacked = await Promise.all(parts.map(unpack));
+  return Object.fromEntries(Object.entries(unpacked[0]).map(([name, { constructor }]) => {
+    const arrays = unpacked.map((part) => part[name]);
+    const all = new constructor(arrays.reduce((sum, { length }) => sum + length, 0));
+    arrays.reduce((end, array) => (all.set(array, end), end + array.length), 0);
+    return [name, all];
+  }));
+}
+
 /** Return positions as floats, and everything else as its bytes. */
 async function unpack(base64) {
   if (!("DecompressionStream" in window)) throw Error("this browser is too old to unpack it");

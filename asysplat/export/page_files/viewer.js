@@ -17,19 +17,25 @@ const held = new Set(), pointers = new Map(); // keys; the last event of each fi
 let scene, renderer, worker;
 let camera, sorted; // the shown one, and that of the order; replaced, never changed
 let place = 0, center = null; // on the path; the point to orbit, once one is needed
-let playing = false, sorting = false, requested = false, lastTime = 0;
+let playing = false, sorting = null, requested = false, lastTime = 0;
 
 function report({ message }) {
   element("message").textContent = `The scene cannot be shown: ${message}.`;
 }
 
-/** Unpack the scene and show its first camera. */
+/** Resolve once the browser has read all of the page. */
+const isComplete = new Promise((resolve) => {
+  if (document.readyState === "loading") addEventListener("DOMContentLoaded", resolve);
+  else resolve();
+});
+
+/** Show the first camera as soon as the first part of the scene is there, and then the whole. */
 async function start() {
   worker = new Worker(URL.createObjectURL(new Blob([element("worker").textContent])));
   worker.onerror = () => report({ message: "this browser refuses its worker" });
-  scene = await unpack(element("spz").textContent);
-  renderer = new Renderer(canvas, scene, settings);
-  worker.postMessage({ positions: scene.positions });
+  renderer = new Renderer(canvas, settings);
+  const parts = document.getElementsByClassName("spz");
+  await load(parts[0]);
   slider.max = path.length - 1;
   element("controls").hidden = path.length < 2;
   show(0);
@@ -37,6 +43,18 @@ async function start() {
   resize(); // now, as the observer may come after the first click
   new ResizeObserver(resize).observe(canvas);
   element("message").hidden = true;
+  await isComplete;
+  if (!parts[1].textContent) return;
+  await load(...parts);
+  setCamera({ ...camera }); // to be sorted
+  await sort();
+}
+
+/** Take these parts of the scene. */
+async function load(...parts) {
+  scene = await unpackAll(parts.map(({ textContent }) => textContent));
+  renderer.setScene(scene);
+  worker.postMessage({ positions: scene.positions });
 }
 
 /** Return the Gaussians in front of a camera, farthest first. */
@@ -47,16 +65,17 @@ function orderOf(camera) {
 }
 
 /** Sort for the shown camera, until it moves no more; what is there is drawn meanwhile. */
-async function sort() {
-  if (sorting) return;
-  sorting = true;
+function sort() {
+  return sorting ??= sortUntilStill().finally(() => { sorting = null; });
+}
+
+async function sortUntilStill() {
   while (sorted !== camera) {
     const next = camera;
     renderer.setOrder(await orderOf(next));
     sorted = next;
     request();
   }
-  sorting = false;
 }
 
 /** Draw soon; nothing is drawn while nothing changes. */
@@ -170,7 +189,8 @@ canvas.ondblclick = ({ offsetX, offsetY }) => {
 };
 canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
 canvas.addEventListener("webglcontextrestored", () => {
-  renderer = new Renderer(canvas, scene, settings);
+  renderer = new Renderer(canvas, settings);
+  renderer.setScene(scene);
   setCamera({ ...camera });
 });
 
