@@ -23,6 +23,7 @@ EXTRAS = {
     "video": "videos, in and out",
     "heif": "photographs as phones save them",
     "masks": "masks=find",
+    "matching": "cameras where SIFT fails",
     "mesh": "meshes of scenes",
     "spz": "SPZ of version 4",
     "sweeps": "sweeps on several processes, or on SLURM",

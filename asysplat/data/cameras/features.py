@@ -54,19 +54,10 @@ def match_photographs(
         pairs: names of two to match; None: of all, or of those that are near in a long sequence.
     """
     database = work / f"{effort.features}.db"
+    write_images(database, work, lenses, cameras)
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=effort.max_side)
     extraction.sift.max_num_features = effort.features
     extraction.sift.peak_threshold = effort.contrast
-    pycolmap.Database.open(database).close()
-    for lens in dict.fromkeys(lenses.values()):
-        options = pycolmap.ImageReaderOptions()
-        if cameras is not None:
-            options.camera_model = cameras[lens].model_name
-            options.camera_params = cameras[lens].params_to_string()
-        # In order: otherwise threads number the images, and no two runs are alike.
-        names = [name for name in lenses if lenses[name] == lens]
-        single = pycolmap.CameraMode.SINGLE
-        pycolmap.import_images(database, work / "images", single, names, options)
     task = progress.add_task("features", total=len(lenses))
     options = pycolmap.ImageReaderOptions()
     if (work / "masks").is_dir():
@@ -80,8 +71,27 @@ def match_photographs(
             extraction_options=extraction,
         )
         progress.advance(task, len(chunk))
-    _match(database, _pairs(list(lenses)) if pairs is None else pairs, effort, progress)
+    _match(database, usual_pairs(list(lenses)) if pairs is None else pairs, effort, progress)
     return database
+
+
+def write_images(
+    database: Path,
+    work: Path,
+    lenses: Mapping[str, AnyLens],
+    cameras: Mapping[AnyLens, pycolmap.Camera] | None = None,
+) -> None:
+    """Write a database of images and their cameras, without features; see `match_photographs`."""
+    pycolmap.Database.open(database).close()
+    for lens in dict.fromkeys(lenses.values()):
+        options = pycolmap.ImageReaderOptions()
+        if cameras is not None:
+            options.camera_model = cameras[lens].model_name
+            options.camera_params = cameras[lens].params_to_string()
+        # In order: otherwise threads number the images, and no two runs are alike.
+        names = [name for name in lenses if lenses[name] == lens]
+        single = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(database, work / "images", single, names, options)
 
 
 def likely_pairs(database: Path, names: Sequence[str]) -> list[tuple[str, str]]:
@@ -118,7 +128,7 @@ def match_further(
         near = range(max(0, number - AROUND), min(len(names), number + AROUND + 1))
         others = {*near, *_anchors(len(names))} - {number}
         pairs |= {(min(number, other), max(number, other)) for other in others}
-    pairs -= {(order[first], order[second]) for first, second in _pairs(names)}
+    pairs -= {(order[first], order[second]) for first, second in usual_pairs(names)}
     named = [(names[i], names[j]) for i, j in sorted(pairs)]
     if not named:
         named = [pair for pair in likely_pairs(database, names) if not {*without}.isdisjoint(pair)]
@@ -136,17 +146,31 @@ def _match(
     task = progress.add_task("matches", total=len(pairs))
     matching = pycolmap.FeatureMatchingOptions(guided_matching=effort.guided)
     matching.sift.max_ratio = effort.ratio
-    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=effort.pair)
-    verification.ransac.random_seed = SEED
     for chunk in _chunks(pairs, CHUNK**2):
-        listed = database.with_name("pairs.txt")
-        listed.write_text("".join(f"{first} {second}\n" for first, second in chunk))
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=_listed(database, chunk))
+        pycolmap.match_image_pairs(database, matching, pairing, _verification(effort))
         progress.advance(task, len(chunk))
 
 
-def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+def verify_pairs(database: Path, pairs: Sequence[tuple[str, str]], effort: Effort) -> None:
+    """Verify matches that are written already by the geometry of two views."""
+    pycolmap.verify_matches(database, _listed(database, pairs), _verification(effort))
+
+
+def _verification(effort: Effort) -> pycolmap.TwoViewGeometryOptions:
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=effort.pair)
+    verification.ransac.random_seed = SEED
+    return verification
+
+
+def _listed(database: Path, pairs: Sequence[tuple[str, str]]) -> Path:
+    listed = database.with_name("pairs.txt")
+    listed.write_text("".join(f"{first} {second}\n" for first, second in pairs))
+    return listed
+
+
+def usual_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """List all pairs of photographs, or of a long sequence those that are near, and anchors."""
     if len(names) <= ALL_PAIRS:
         return list(combinations(names, 2))
     gaps = {*range(1, FOLLOWING + 1)} | {2**k for k in range(4, len(names).bit_length())}

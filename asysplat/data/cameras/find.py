@@ -25,6 +25,7 @@ from asysplat.data.cameras.features import (
     likely_pairs,
     match_further,
     match_photographs,
+    usual_pairs,
 )
 from asysplat.data.cameras.folder import (
     colmap_names,
@@ -34,6 +35,7 @@ from asysplat.data.cameras.folder import (
     save_mask,
     work_folder,
 )
+from asysplat.data.cameras.learned import LEARNED_EFFORT, has_learned_features, match_learned
 from asysplat.data.frames import SUFFIXES, save_sharp_frames
 from asysplat.data.images import image_size
 from asysplat.data.readers import open_scene, photographs_in
@@ -44,6 +46,7 @@ from asysplat.errors import InputError
 MIN_FOUND = 0.25  # fraction of the photographs; with fewer there is no scene
 ENOUGH = 0.9  # fraction of the photographs; with fewer the next attempt is made
 LEAST_PHOTOGRAPHS = 3
+LISTED = 10  # most photographs without a camera of which one is told why
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ class Attempt:
 
 
 ATTEMPTS = (Attempt(USUAL, 100, 30, 16.0), Attempt(HARD, 50, 15, 4.0))
+LEARNED = Attempt(LEARNED_EFFORT, 50, 15, 4.0)
 
 
 def find_cameras(
@@ -73,7 +77,8 @@ def find_cameras(
     has the cameras and points. Where fewer than 9 of 10 cameras are found, the photographs of a
     sequence that are left are matched with more of the others; if there still are, a second attempt
     with weaker features of the pairs that matched most follows, and at its end one along epipolar
-    lines for those that are left; the best is returned.
+    lines for those that are left, and where it is installed a third with learned features; the
+    best is returned.
 
     Args:
         photographs: folder of photographs of one place, or of an images/ with them; a scene whose
@@ -87,7 +92,8 @@ def find_cameras(
     lenses = {} if video else _lenses(files, source, on_error)
     masks = {file: mask for file in lenses if (mask := find_mask(file)) is not None}
     separate_masks = [mask for file, mask in masks.items() if mask != file]
-    folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *separate_masks])}"
+    attempts = (*ATTEMPTS, LEARNED) if has_learned_features() else ATTEMPTS
+    folder = where / f"{source.stem}-{digest(f'{attempts} {frames}', [*files, *separate_masks])}"
     if folder.is_dir():
         return folder
     with work_folder(where, frames if video else len(files), console) as (work, progress):
@@ -103,9 +109,11 @@ def find_cameras(
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
         model = database = None
-        for attempt in ATTEMPTS:
-            pairs = None if database is None else likely_pairs(database, list(kinds))
-            database = match_photographs(work, kinds, attempt.effort, progress, pairs=pairs)
+        for attempt in attempts:
+            every = list(kinds)
+            pairs = usual_pairs(every) if database is None else likely_pairs(database, every)
+            match = match_learned if attempt is LEARNED else match_photographs
+            database = match(work, kinds, attempt.effort, progress, pairs=pairs)
             grown = _reconstruct(work, kinds, database, attempt, progress)
             model = max(model, grown, key=_registered)
             if _registered(model) >= ENOUGH * len(kinds):
@@ -115,6 +123,9 @@ def find_cameras(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
                 "photographs: too few show the same place; photograph it with more overlap."
             )
+        assert database is not None  # there are attempts
+        if console is not None and (why := _why_left(database, model, list(kinds))):
+            console.print(f"no camera: {why}", highlight=False, markup=False)
         keep(work, model, folder)
     return folder
 
@@ -159,6 +170,26 @@ def _registered(model: pycolmap.Reconstruction | None) -> int:
     return 0 if model is None else model.num_reg_images()
 
 
+def _why_left(database: Path, model: pycolmap.Reconstruction, names: Sequence[str]) -> str:
+    """List the photographs without a camera, and how many features and matches each has."""
+    found = {image.name for image in model.images.values() if image.has_pose}
+    left = [name for name in names if name not in found]
+    most = dict.fromkeys(left, 0)
+    with pycolmap.Database.open(database) as stored:
+        images = {image.image_id: image.name for image in stored.read_all_images()}
+        numbers = {name: number for number, name in images.items()}
+        features = {name: stored.num_keypoints_for_image(numbers[name]) for name in left}
+        for pair, count in zip(*stored.read_two_view_geometry_num_inliers(), strict=True):
+            for name in map(images.get, pycolmap.pair_id_to_image_pair(pair)):
+                if name in most:
+                    most[name] = max(most[name], count)
+    listed = [
+        f"{name} ({features[name]:,} features, at most {most[name]} shared with another)"
+        for name in left[:LISTED]
+    ]
+    return ", ".join(listed + [f"and {len(left) - LISTED} more"] * (len(left) > LISTED))
+
+
 def _reconstruct(
     work: Path,
     lenses: dict[str, tuple],
@@ -172,7 +203,7 @@ def _reconstruct(
     on with them.
     """
     model = _map(work, lenses, database, attempt, progress)
-    if model is None or _registered(model) >= ENOUGH * len(lenses):
+    if model is None or _registered(model) >= ENOUGH * len(lenses) or attempt is LEARNED:
         return model
     if len(lenses) <= ALL_PAIRS and attempt is not ATTEMPTS[-1]:
         return model  # weaker features of all are found sooner, and their cameras are more exact

