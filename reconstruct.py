@@ -59,7 +59,7 @@ from asysplat.refinement import (
     refine,
     refine_scaffold,
     with_options,
-    without_unseen,
+    without_unneeded,
 )
 from asysplat.refinement.exposure import even_exposures, find_exposures
 from asysplat.refinement.init import INITS, initial_gaussians, sweep
@@ -133,7 +133,7 @@ def reconstruct(config: DictConfig) -> None:
             results.save_video(anchors)
             return
         refined = refine(gaussians, fitted.inputs, settings, estimate=estimate, **options)
-        gaussians = without_unseen(refined, fitted.inputs)
+        gaussians = without_unneeded(refined, fitted.inputs)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
@@ -215,7 +215,7 @@ def fit_to_all(
     )
     for name in {"steps", "seconds"} & options.keys():
         options = options | {name: type(options[name])(max(1, fraction * options[name]))}
-    return without_unseen(refine(gaussians, views, settings, **options), views)
+    return without_unneeded(refine(gaussians, views, settings, **options), views)
 
 
 def given_options() -> set[str]:

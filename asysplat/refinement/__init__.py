@@ -2,7 +2,7 @@
 
 from asysplat.refinement.init import merge_to_limit
 from asysplat.refinement.predict import predict, predict_in_windows
-from asysplat.refinement.refine import Refinement, RefinementProgress, refine, without_unseen
+from asysplat.refinement.refine import Refinement, RefinementProgress, refine, without_unneeded
 from asysplat.refinement.scaffold_gs import (
     SCAFFOLD_GS,
     AnchorScene,
@@ -41,5 +41,5 @@ __all__ = [
     "refine",
     "refine_scaffold",
     "with_options",
-    "without_unseen",
+    "without_unneeded",
 ]
