@@ -66,6 +66,9 @@ def predict_in_windows(network: Network, views: Views, window: int = DEPTH_VIEWS
         views: [V].
         window: most views at a time, at least 1.
 
+    Raises:
+        InputError: window out of range; see `Network.forward`.
+
     Example:
         >>> from asysplat import load, open_photographs
         >>> from asysplat.refinement import predict_in_windows

@@ -109,9 +109,9 @@ def find_cameras(
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
         model = database = None
+        order = list(kinds)
         for attempt in attempts:
-            every = list(kinds)
-            pairs = usual_pairs(every) if database is None else likely_pairs(database, every)
+            pairs = usual_pairs(order) if database is None else likely_pairs(database, order)
             match = match_learned if attempt is LEARNED else match_photographs
             database = match(work, kinds, attempt.effort, progress, pairs=pairs)
             grown = _reconstruct(work, kinds, database, attempt, progress)
@@ -124,7 +124,7 @@ def find_cameras(
                 "photographs: too few show the same place; photograph it with more overlap."
             )
         assert database is not None  # there are attempts
-        if console is not None and (why := _why_left(database, model, list(kinds))):
+        if console is not None and (why := _why_left(database, model, order)):
             console.print(f"no camera: {why}", highlight=False, markup=False)
         keep(work, model, folder)
     return folder
