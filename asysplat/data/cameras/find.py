@@ -119,9 +119,11 @@ def find_cameras(
             if _registered(model) >= ENOUGH * len(kinds):
                 break
         if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
+            otherwise = "" if LEARNED in attempts else ", or pip install 'asysplat[matching]'"
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
-                "photographs: too few show the same place; photograph it with more overlap."
+                "photographs: too few show the same place; photograph it with more overlap"
+                f"{otherwise}."
             )
         assert database is not None  # there are attempts
         if console is not None and (why := _why_left(database, model, order)):
@@ -231,6 +233,8 @@ def _map(
     options = pycolmap.IncrementalPipelineOptions(
         min_num_matches=attempt.effort.pair, min_model_size=LEAST_PHOTOGRAPHS, random_seed=SEED
     )
+    if attempt is LEARNED:  # matches are so few that the order of threads would decide
+        options.num_threads = 1
     options.mapper.init_min_num_inliers = attempt.first_pair
     options.mapper.init_min_tri_angle = attempt.angle
     options.mapper.abs_pose_min_num_inliers = attempt.image
