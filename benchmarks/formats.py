@@ -60,7 +60,8 @@ def measure(options: DictConfig, console: Console) -> Result:
             row = {"format": suffix, "megabytes": path.stat().st_size / 1e6} | common
             row |= {name: measurement.summarize(name) for name in measurement.seconds}
             if path.suffix in READERS:
-                row["psnr"] = picture_psnr(gaussians, read_gaussians(path), cameras, notes)
+                written = read_gaussians(path)
+                row["psnr"] = picture_psnr(gaussians, written, cameras, **notes.look)
             rows.append(row)
     return {"rows": rows}
 

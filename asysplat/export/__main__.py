@@ -69,7 +69,7 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     if keep < 1:
         pictures = 0 if cameras is None else cameras.num_views
         print(f"weighing {written.num_gaussians:,} Gaussians in {pictures} pictures")
-        written = most_important(written, keep, cameras)
+        written = written.keep(most_important(written, keep, cameras))
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
     content = f"{written.num_gaussians:,} Gaussians"
@@ -90,7 +90,7 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     if any(notes.offset) and read_notes(output).offset != notes.offset:
         print(f"{output.suffix} has no place for the offset {' '.join(map(repr, notes.offset))}")
     if cameras is not None and output.suffix.lower() in READERS and suffix not in MESHES:
-        likeness = picture_psnr(gaussians, read_gaussians(output), cameras, notes)
+        likeness = picture_psnr(gaussians, read_gaussians(output), cameras, **notes.look)
         print(f"{likeness:.1f} dB against the pictures of {scene}")
 
 

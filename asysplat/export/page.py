@@ -15,10 +15,11 @@ import torch
 from asysplat.data.selection import evenly_spaced
 from asysplat.errors import InputError
 from asysplat.export.formats import packing, spz
+from asysplat.export.importance import most_important
 from asysplat.export.viewer_cameras import mean_up, quaternion
 from asysplat.files import atomic_write
 from asysplat.geometry import spherical_harmonics
-from asysplat.rendering import INRIA, blending_weights
+from asysplat.rendering import INRIA
 from asysplat.scene import Cameras, Gaussians
 
 PAGE = ".html"
@@ -120,10 +121,7 @@ def _parts(gaussians: Gaussians, cameras: Cameras) -> tuple[str, str]:
     """Return the Gaussians that are drawn first, and the rest, if any, as SPZ in base64."""
     count = min(WEIGHED_VIEWS, cameras.num_views)
     chosen = cameras.select(evenly_spaced(range(cameras.num_views), count)).to(torch.float32)
-    weights = blending_weights(gaussians, chosen)
-    count = max(1, int(FIRST_PART * gaussians.num_gaussians))
-    is_first = torch.zeros_like(weights, dtype=torch.bool)
-    is_first[weights.topk(count).indices] = True
+    is_first = most_important(gaussians, FIRST_PART, chosen)
     parts = (gaussians.keep(mask) for mask in (is_first, ~is_first) if mask.any())
     first, *rest = (b64encode(spz.encode_spz(part)).decode() for part in parts)
     return first, "".join(rest)
